@@ -12,6 +12,8 @@ _FLAGS = {
     "exposures_s": "exposure-s",
     "kind": "board",
     "line_shift_period_px": "period-px",
+    "sine_period_px": "period-px",
+    "sine_steps": "steps",
     "turned_by": "manual",
 }
 """Flags of the command line with another name than the setting."""

@@ -206,4 +206,5 @@ class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
             gap_s=options.light_margin_s + (light.before_us + light.after_us) / 1e6,
             duty=options.duty_limit,
             lights=options.colour is LedColour.WHITE,
+            shades=False,
         )

@@ -165,6 +165,7 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
             gap_s=options.light_margin_s,
             duty=options.duty_limit,
             lights=options.colour is LedColour.WHITE,
+            shades=False,
         )
 
     def _check_flash(self) -> None:

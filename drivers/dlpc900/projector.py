@@ -183,4 +183,5 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
             gap_s=options.light_margin_s + mirrors.least_us / 1e6,
             duty=options.duty_limit,
             lights=options.colour is LedColour.WHITE,
+            shades=False,
         )

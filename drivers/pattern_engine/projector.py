@@ -80,8 +80,8 @@ def pattern_plane(sequence: PatternSequence, index: int) -> Plane:
     lit: NDArray[np.bool_] = profile == np.iinfo(profile.dtype).max
     if not (lit | (profile == 0)).all():
         message = (
-            f"pattern {index} has shades of grey; a mirror is on or off: use Gray code and shifted lines, "
-            "which are black and white"
+            f"pattern {index} has shades of grey, and this driver plays patterns of 1 bit: use lines, or connect the "
+            "engine's video input and drive it as a display (driver screen or kms), which shows 8 bits"
         )
         raise UnsupportedByDeviceError(message)
     return np.broadcast_to(lit, sequence.projector.shape)

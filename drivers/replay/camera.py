@@ -331,7 +331,7 @@ class ReplayProjector:
                     f"the recording '{self._info.serial}' has no frame of {_describe_pattern(pattern)} from camera "
                     f"{', '.join(missing)}; it has {recorded}. Leave the patterns out of the "
                     "request and of the rig file's [scan] to replay all recorded ones; or request some of them: "
-                    f"{setting('gray_cell_px')}, {setting('line_shift_period_px')} and similar settings"
+                    f"{setting('sequence')}, {setting('line_shift_period_px')} and similar settings"
                 )
                 raise UnsupportedByDeviceError(message)
         self.blank()

@@ -38,7 +38,7 @@ from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import USUAL_PATTERNS, PoseRecord, SessionRecord, pose_of
 from slrig.calibrate.store import REPORT, picture_name
 from slrig.calibration import DEFAULT_BOARD, Board, BoardKind
-from slrig.errors import ArtefactNotReadyError, CameraNotFoundError
+from slrig.errors import ArtefactNotReadyError, CameraNotFoundError, ConfigError
 
 IMPORT_PATH = "/calibration/import"
 MOST_IMPORT_BYTES = MAX_CALIBRATION_BYTES
@@ -84,12 +84,18 @@ def open_calibration(
     request: Annotated[CalibrationRequest, Body(default_factory=CalibrationRequest)],
 ) -> CalibrationBody:
     """Open a calibration session for a board. Touches no device."""
-    patterns = pattern_plan(request.patterns, service.scan_defaults)
     # A pose is shot once and counts for long: its rows and its sequence are not what scans of the rig play.
     usual = {
         key: getattr(USUAL_PATTERNS, key) for key in ("rows", "sequence") if getattr(request.patterns, key) is None
     }
-    patterns = replace(patterns, **usual, codes=request.projector)
+    patterns = pattern_plan(request.patterns.model_copy(update=usual), service.scan_defaults)
+    patterns = replace(patterns, codes=request.projector)
+    if patterns.named.sines:
+        message = (
+            f"patterns.sequence: {patterns.sequence} plays sinusoids, and poses are read by Gray code; leave it out, "
+            f"and {USUAL_PATTERNS.sequence} is played. Scans of the rig may still play {patterns.sequence}"
+        )
+        raise ConfigError(message)
     board = DEFAULT_BOARD if request.board is None else request.board.board()
     record = service.calibrations.open(board, label=request.label, patterns=patterns)
     response.headers["Location"] = f"/calibration/{record.id}"

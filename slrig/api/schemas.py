@@ -35,7 +35,7 @@ from slrig.bundle import (
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobRecord, JobState
 from slrig.model import Axis, FlipRule, SequenceName, Size
-from slrig.scan.plan import MOST_TURN_DEG, PatternPlan, PresetUse, ReconstructionPlan, ScanPlan
+from slrig.scan.plan import MOST_TURN_DEG, PatternPlan, PresetUse, ReconstructionPlan, ScanPlan, unused_options
 
 MOST_EXPOSURE_S = 60.0
 MOST_REPEATS = 500
@@ -49,7 +49,8 @@ class PatternRequest(Strict):
     sequence: Annotated[SequenceName, Field(strict=False)] | None = Field(
         default=None,
         description="what stands where the options below say nothing: `fast`, fewest frames; `standard`; `robust`, "
-        "each bit with its inverse, for reflecting and concave objects. Default standard",
+        "each bit with its inverse, for reflecting and concave objects; `phase`, sinusoids in few frames, "
+        "where the projector shows shades of grey. Default standard",
     )
     line_shift: bool | None = Field(default=None, description="false: Gray code only. Default true")
     line_shift_period_px: Annotated[int, Field(ge=4, le=1024)] | None = Field(
@@ -62,6 +63,13 @@ class PatternRequest(Strict):
     )
     line_width_px: Annotated[int, Field(ge=1, le=256)] | None = Field(
         default=None, description="of a line, projector pixels. Default: half the line period"
+    )
+    sine_period_px: Annotated[int, Field(ge=4, le=1024)] | None = Field(
+        default=None, description="of `phase`: period of the shortest sinusoid, projector pixels. Default 8"
+    )
+    sine_steps: Annotated[int, Field(ge=3, le=64)] | None = Field(
+        default=None,
+        description="of `phase`: frames of each sinusoid. Default 4; 3 take less time, bent more by gamma",
     )
     gray_cell_px: Annotated[int, Field(ge=1, le=1024)] | None = Field(
         default=None, description="width of the finest Gray cell. Default: half the line period, or 2 without lines"
@@ -222,8 +230,17 @@ def scan_plan(request: ShotRequest, defaults: ScanDefaults, preset: PresetDocume
 
 
 def pattern_plan(request: PatternRequest, defaults: ScanDefaults) -> PatternPlan:
-    """The patterns that a request means on a rig with these defaults."""
-    return PatternPlan(**_chosen(PatternPlan, request, defaults))
+    """The patterns that a request means on a rig with these defaults. Of those, what is of lines or of sinusoids counts
+    in their own sequences only. Raises ConfigError: the request has options of the one beside a sequence of the other.
+
+    >>> asked = PatternRequest(sequence="phase", sine_period_px=16)
+    >>> pattern_plan(asked, ScanDefaults(line_width_px=1)) == PatternPlan(sequence="phase", sine_period_px=16)
+    True
+    """
+    chosen = _chosen(PatternPlan, request, defaults)
+    unused = unused_options(chosen.get("sequence", SequenceName.STANDARD))
+    counts = (key for key in chosen if key not in unused or getattr(request, key) is not None)
+    return PatternPlan(**{key: chosen[key] for key in counts})
 
 
 def _chosen(plan: type[Any], request: BaseModel, defaults: ScanDefaults) -> dict[str, Any]:

@@ -403,6 +403,8 @@ class ScanDefaults(Strict):
     line_shift_period_px: Annotated[int, Field(ge=4)] | None = None
     line_steps: Annotated[int, Field(ge=3)] | None = None
     line_width_px: Annotated[int, Field(ge=1)] | None = None
+    sine_period_px: Annotated[int, Field(ge=4)] | None = None
+    sine_steps: Annotated[int, Field(ge=3)] | None = None
     inverses: bool | None = None
     gray_cell_px: Annotated[int, Field(ge=1)] | None = None
     gray_offset_px: Annotated[int, Field(ge=0)] | None = None

@@ -27,6 +27,7 @@ from slrig.cli.options import (
     ServiceOptions,
     given,
     grouped,
+    period_option,
 )
 from slrig.cli.patterns import patterns
 from slrig.cli.scan_options import ScanOptions
@@ -115,13 +116,16 @@ def scan(
         typer.Option(help="Exposure of every camera, seconds; repeated, a bracket for what is dark here, shiny there."),
     ] = None,
     sequence: Annotated[
-        Literal["fast", "standard", "robust"] | None,
+        Literal["fast", "standard", "robust", "phase"] | None,
         typer.Option(
-            help="Patterns: fewest frames; the usual ones; each bit with its inverse, for what reflects or is hollow. "
-            "Default: the rig file's, or standard."
+            help="Patterns: fewest frames; the usual ones; each bit with its inverse, for what reflects or is hollow; "
+            "sinusoids in few frames. Default: the rig file's, or standard."
         ),
     ] = None,
-    period_px: Annotated[int | None, typer.Option(help="Distance of two lines in one frame, projector pixels.")] = None,
+    period_px: Annotated[
+        int | None, typer.Option(help="Distance of two lines, or with --sequence phase the period, projector pixels.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(help="With --sequence phase: frames of each sinusoid.")] = None,
     line_width_px: Annotated[int | None, typer.Option(help="Width of a line, projector pixels.")] = None,
     gray_cell_px: Annotated[int | None, typer.Option(help="Width of the finest Gray cell, projector pixels.")] = None,
     gray_only: Annotated[bool, typer.Option("--gray-only", help="Play the Gray code without shifted lines.")] = False,
@@ -147,8 +151,8 @@ def scan(
         repeat=repeat if repeat > 1 else None,
         every_s=every_s,
         patterns=given(
-            sequence=sequence, line_shift_period_px=period_px, line_width_px=line_width_px, gray_cell_px=gray_cell_px,
-            line_shift=False if gray_only else None, rows=rows or None,
+            sequence=sequence, line_width_px=line_width_px, gray_cell_px=gray_cell_px, sine_steps=steps,
+            **period_option(sequence, period_px), line_shift=False if gray_only else None, rows=rows or None,
         ),
         reconstruction=mesh.asked(),
     )  # fmt: skip

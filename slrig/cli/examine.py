@@ -67,6 +67,7 @@ def doctor(
                 displays=displays,
                 period_px=lines.period_px,
                 steps=lines.steps or lines.period_px,
+                sines=lines.sines,
                 search_s=search_s,
                 progress=display,
             )

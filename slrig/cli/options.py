@@ -262,6 +262,15 @@ def given(**options: object) -> dict[str, object]:
     return {name: value for name, value in options.items() if value is not None}
 
 
+def period_option(sequence: str | None, period_px: int | None) -> dict[str, int | None]:
+    """The option of a request that --period-px means with this sequence.
+
+    >>> period_option("phase", 16), period_option(None, 16)
+    ({'sine_period_px': 16}, {'line_shift_period_px': 16})
+    """
+    return {"sine_period_px" if sequence == "phase" else "line_shift_period_px": period_px}
+
+
 def by_beginning(
     known: Sequence[Mapping[str, Any]], beginning: str, noun: str, refusal: type[SlrigError], *, none: str = "none"
 ) -> Mapping[str, Any]:

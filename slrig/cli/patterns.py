@@ -8,17 +8,19 @@ from typing import Annotated, Literal
 
 import typer
 
-from slrig.cli.options import RigFile, given
+from slrig.cli.options import RigFile, given, period_option
 
 
 def patterns(
     rig: RigFile,
     sequence: Annotated[
-        Literal["fast", "standard", "robust"] | None, typer.Option(help="If scans ask for another than the rig file.")
+        Literal["fast", "standard", "robust", "phase"] | None,
+        typer.Option(help="If scans ask for another than the rig file."),
     ] = None,
     period_px: Annotated[
-        int | None, typer.Option(help="Distance of two lines in one frame, if scans ask for another one.")
+        int | None, typer.Option(help="Distance of two lines, or period of phase, if scans ask for another one.")
     ] = None,
+    steps: Annotated[int | None, typer.Option(help="Frames of a sinusoid, if scans ask for other ones.")] = None,
     line_width_px: Annotated[int | None, typer.Option(help="Width of a line, if scans ask for another one.")] = None,
     gray_cell_px: Annotated[
         int | None, typer.Option(help="Width of the finest Gray cell, if scans ask for another one.")
@@ -29,7 +31,8 @@ def patterns(
     For trigger boxes and light engines: all that scans, calibration, verification and the doctor show, each once.
     """
     asked = given(
-        sequence=sequence, line_shift_period_px=period_px, line_width_px=line_width_px, gray_cell_px=gray_cell_px,
+        sequence=sequence, line_width_px=line_width_px, gray_cell_px=gray_cell_px, sine_steps=steps,
+        **period_option(sequence, period_px),
     )  # fmt: skip
     typer.echo(written_patterns(rig, asked))
 

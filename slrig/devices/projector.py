@@ -20,7 +20,8 @@ class ProjectorInfo:
     typical time from `show` to light. refresh_s : refresh period of a projector whose light is constant only over whole
     periods; None if exposures may have any length. limits : time-outs of its calls. recorded : patterns of a recording,
     in its order, which a scan plays by default; empty if the projector shows any pattern. lights : True if it has
-    separate red, green and blue lights, and shows `Primary`.
+    separate red, green and blue lights, and shows `Primary`. shades : False if it shows black and white only, so that
+    it refuses patterns with shades of grey.
     """
 
     name: str
@@ -35,6 +36,7 @@ class ProjectorInfo:
     gap_s: float = 0.0005
     duty: float = 1.0
     lights: bool = False
+    shades: bool = True
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,15 +28,24 @@ class ExposureAdvice:
 
 @dataclass(frozen=True, slots=True)
 class LineAdvice:
-    """Distance of lines that suits the blur of a rig, projector pixels.
+    """Distance of lines, or period of sinusoids, that suits the blur of a rig, projector pixels.
 
-    steps : number of line frames. gain : factor by which points have less noise than with the rig's own lines.
+    steps : number of their frames. gain : factor by which points have less noise than with the rig's own lines.
+    sines : True for sinusoids.
     """
 
     period_px: int
     steps: int
     gain: float
     reason: str
+    sines: bool = False
+
+    @property
+    def options(self) -> dict[str, int]:
+        """The keys for `[scan]`, with their values."""
+        if self.sines:
+            return {"sine_period_px": self.period_px, "sine_steps": self.steps}
+        return {"line_shift_period_px": self.period_px, "line_steps": self.steps}
 
     @property
     def gain_text(self) -> str:
@@ -44,8 +53,9 @@ class LineAdvice:
         return f"{self.gain:.1f} times less noise" if self.gain < 10 else "less than a tenth of the noise"
 
 
-def advise_lines(blur_px: float, own_period_px: int, own_steps: int) -> LineAdvice | None:
-    """Return the lines that leave least noise under a Gaussian blur; None if the rig's own are nearly as good.
+def advise_lines(blur_px: float, own_period_px: int, own_steps: int, *, sines: bool = False) -> LineAdvice | None:
+    """Return the lines, or sinusoids of as many steps, that leave least noise under a Gaussian blur; None if the rig's
+    own are nearly as good.
 
     The standard deviation of a point is proportional to period/(contrast · √steps), and the first harmonic keeps
     exp(−2 (π σ/period)²) of its contrast, so the best period is 2 π σ. Periods longer than the default have at most
@@ -59,12 +69,13 @@ def advise_lines(blur_px: float, own_period_px: int, own_steps: int) -> LineAdvi
     def deviation(period_px: int, steps: int) -> float:
         return period_px * math.exp(2 * (math.pi * blur_px / period_px) ** 2) / math.sqrt(steps)
 
-    best = min(((period_px, _line_steps(period_px)) for period_px in _PERIODS_PX), key=lambda each: deviation(*each))
+    offered = ((period_px, own_steps if sines else _line_steps(period_px)) for period_px in _PERIODS_PX)
+    best = min(offered, key=lambda each: deviation(*each))
     gain = deviation(own_period_px, own_steps) / deviation(*best)
     if gain < _MIN_GAIN:
         return None
     reason = f"measured: bars are blurred by {blur_px:.1f} projector pixels (standard deviation)"
-    return LineAdvice(*best, gain, reason)
+    return LineAdvice(*best, gain, reason, sines)
 
 
 def _line_steps(period_px: int) -> int:

@@ -94,6 +94,7 @@ def examine(
     displays: Sequence[FoundDevice] = (),
     period_px: int = DEFAULT_PERIOD_PX,
     steps: int = DEFAULT_PERIOD_PX,
+    sines: bool = False,
     search_s: float = DEFAULT_SEARCH_S,
     progress: ProgressCallback = lambda _stage, _fraction, _detail: None,
 ) -> Diagnosis:
@@ -101,10 +102,11 @@ def examine(
 
     own_sequence : patterns of a scan on this rig, for a projector that can show only the patterns it holds.
     displays : projectors and outputs that the finders found, including the rig's own.
-    period_px : distance of the lines that this rig scans with; steps : number of frames of them.
+    period_px : distance of the lines that this rig scans with; steps : number of frames of them. sines : it scans with
+    sinusoids of that period in place of lines.
     search_s : longest latency to search for. progress : called with the stage, the fraction done, and a detail.
     """
-    run = _DoctorRun(rig, own_sequence, displays, period_px, steps, search_s, progress)
+    run = _DoctorRun(rig, own_sequence, displays, period_px, steps, sines, search_s, progress)
     try:
         run.run()
     finally:
@@ -125,6 +127,7 @@ class _DoctorRun:
     displays: Sequence[FoundDevice]
     period_px: int
     steps: int
+    sines: bool
     search_s: float
     progress: ProgressCallback
 
@@ -168,7 +171,7 @@ class _DoctorRun:
         findings = tuple(sorted(self.findings, key=lambda each: order.index(each.severity)))
         blurs_px = [blur_px for blur_px in self._blurs_px if math.isfinite(blur_px)]
         # The camera with the greatest blur decides.
-        lines = advise_lines(max(blurs_px), self.period_px, self.steps) if blurs_px else None
+        lines = advise_lines(max(blurs_px, default=math.inf), self.period_px, self.steps, sines=self.sines)
         return Diagnosis(
             self.rig.name, findings, self._advice, lines, self.synchronisation, self.refresh_hz, self.curve,
             self.flickers,
@@ -255,7 +258,9 @@ class _DoctorRun:
         for name, light in self.lights.items():
             picture, findings = locate_picture(self._open_session(name), self.sequence, light, self.rig.calibration)
             self.findings += findings
-            blur_px, findings = check_focus(name, self.sequence, light, picture, period_px=self.period_px)
+            blur_px, findings = check_focus(
+                name, self.sequence, light, picture, period_px=self.period_px, steps=self.steps, sines=self.sines
+            )
             self._blurs_px.append(blur_px)
             self.findings += findings
             self.findings += check_sharpening(name, light, picture, self.rig.calibration)

@@ -50,9 +50,17 @@ _EXPOSURE_SHARES = (1.0, 0.5, 0.25)
 
 
 def check_focus(
-    name: str, sequence: PatternSequence, light: LightMeasurement, picture: LocatedPicture, *, period_px: int
+    name: str,
+    sequence: PatternSequence,
+    light: LightMeasurement,
+    picture: LocatedPicture,
+    *,
+    period_px: int,
+    steps: int,
+    sines: bool = False,
 ) -> tuple[float, list[Finding]]:
-    """Return the blur of the bars, standard deviation in projector pixels, and whether lines `period_px` apart survive.
+    """Return the blur of the bars, standard deviation in projector pixels, and whether lines or `sines` of `period_px`
+    survive.
 
     The blur is that of projector, camera and pixels together, along the axis where it is greater: 0 if even the finest
     bars are sharp, infinite if no bars are visible, NaN if no code can be read.
@@ -76,17 +84,16 @@ def check_focus(
         if math.isfinite(worst_px)
         else "even wide bars are blurred beyond recognition"
     )
-    message = f"{blurred}: lines {period_px} px apart keep {contrast:.0%} of their contrast"
+    patterns = f"sinusoids of {period_px} px" if sines else f"lines {period_px} px apart"
+    message = f"{blurred}: {patterns} keep {contrast:.0%} of their contrast"
     if contrast >= _NOTE_CONTRAST:
         return worst_px, [ok("focus.sharp", subject, message)]
     kind = fault if contrast < _FAULT_CONTRAST else note
     device, reason, remedy = _defocused_device(_object_edge_blur(sequence, light, picture), worst_px * camera_px)
-    advice = advise_lines(worst_px, period_px, period_px)
+    advice = advise_lines(worst_px, period_px, steps if sines else period_px, sines=sines)
     if advice is not None:
-        remedy += (
-            f"; until then line_shift_period_px = {advice.period_px} and line_steps = {advice.steps} in [scan]: "
-            f"{advice.gain_text} is expected"
-        )
+        options = " and ".join(f"{key} = {value}" for key, value in advice.options.items())
+        remedy += f"; until then {options} in [scan]: {advice.gain_text} is expected"
     subject = "projector" if device == "projector" else subject
     return worst_px, [kind(f"focus.{device}", subject, f"{message}. {reason}", remedy)]
 
@@ -263,7 +270,8 @@ def _check_projector_response(curve: ResponseCurve) -> list[Finding]:
             "gamma",
             f"light grows with the grey value to the power of {curve.gamma:.2f}, not in proportion (rms "
             f"{curve.residual:.1%} from that law)",
-            "black and white patterns do not suffer, unless something on their way makes greys of them: keep the "
+            "black and white patterns do not suffer, and sinusoids of four steps little, unless something on their way "
+            "makes greys of them: keep the "
             "output at the projector's native resolution, unscaled, sharpness neutral. If the menu offers a gamma "
             "of 1 (linear, DICOM off, no presentation mode), choose it",
         ),

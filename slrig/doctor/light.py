@@ -587,8 +587,8 @@ def _check_orientation(
     if orientation.camera_px < _MIN_CAMERA_PX:
         message = f"one projector pixel is only {orientation.camera_px:.2f} camera pixels long: it loses fine patterns"
         remedy = (
-            "bring the camera nearer or give it a longer lens, or choose line_shift_period_px = "
-            f"{int(np.ceil(4 / orientation.camera_px))} or more in [scan]"
+            "bring the camera nearer or give it a longer lens, or choose line_shift_period_px (of the sequence phase: "
+            f"sine_period_px) = {int(np.ceil(4 / orientation.camera_px))} or more in [scan]"
         )
         yield note("picture.resolution", subject, message, remedy)
 

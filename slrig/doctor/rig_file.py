@@ -68,10 +68,10 @@ def rig_file_text(data: Mapping[str, Any], diagnosis: Diagnosis, *, source: Path
     if lines is not None:
         table = tables.setdefault("scan", {})
         # These belong to the old period; their defaults follow the new one.
-        for key in ("line_width_px", "gray_cell_px"):
+        for key in () if lines.sines else ("line_width_px", "gray_cell_px"):
             table.pop(key, None)
-        table |= {"line_shift_period_px": lines.period_px, "line_steps": lines.steps}
-        comments["scan", "line_shift_period_px"] = f"{lines.reason}; {lines.gain_text} is expected"
+        table |= lines.options
+        comments["scan", next(iter(lines.options))] = f"{lines.reason}; {lines.gain_text} is expected"
     measured = diagnosis.synchronisation
     if measured is not None:
         latency_s, error_s = round(measured.latency_s, 6), round(measured.latency_error_s, 6)

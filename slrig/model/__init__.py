@@ -62,6 +62,7 @@ from slrig.model.patterns import (
     from_gray,
     gray_index,
     has_even_shifts,
+    sine_groups,
     to_gray,
 )
 from slrig.model.plausibility import (
@@ -159,6 +160,7 @@ __all__ = [
     "require_array",
     "require_plausible",
     "rig_layout",
+    "sine_groups",
     "srgb_to_linear",
     "to_gray",
     "triangulated_axis",

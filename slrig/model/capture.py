@@ -8,7 +8,7 @@ from itertools import pairwise
 
 from slrig.errors import BundleError
 from slrig.model.geometry import Axis, Pixels, Size, require_array
-from slrig.model.patterns import Gray, LineShift, Pattern
+from slrig.model.patterns import Gray, LineShift, Pattern, Sine
 
 MIN_EXPOSURES, MAX_EXPOSURES = 2, 6
 """Number of exposures in a bracket."""
@@ -130,8 +130,8 @@ class CaptureHeader:
 
     @property
     def axes(self) -> frozenset[Axis]:
-        """Axes with Gray code frames."""
-        return frozenset(pattern.axis for pattern in self.displayed_patterns if isinstance(pattern, Gray))
+        """Axes with frames of Gray code or sinusoids."""
+        return frozenset(pattern.axis for pattern in self.displayed_patterns if isinstance(pattern, Gray | Sine))
 
 
 def bracket_fault(exposures_s: Sequence[float]) -> str | None:

@@ -63,6 +63,7 @@ class SequenceName(StrEnum):
     FAST = "fast"
     STANDARD = "standard"
     ROBUST = "robust"
+    PHASE = "phase"
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,6 +186,16 @@ class Sine:
         if self.steps % 2:
             return None
         return replace(self, shift=(self.shift + self.steps // 2) % self.steps)
+
+
+def sine_groups(patterns: Sequence[Sine]) -> list[list[int]]:
+    """Return the indices of the frames of each period with three or more shifts, the finest period first.
+
+    Such frames give level, modulation and phase of a pixel by themselves.
+    """
+    periods = sorted({each.period_px for each in patterns})
+    members = [[i for i, each in enumerate(patterns) if each.period_px == period] for period in periods]
+    return [each for each in members if len({patterns[i].shift / patterns[i].steps for i in each}) >= MIN_LINE_STEPS]
 
 
 def has_even_shifts(lines: Sequence[LineShift]) -> bool:

@@ -6,7 +6,7 @@ import {ask, follow, once, useAction, useValue} from "./service.js";
 import {Action, JobBadge, Progress, Refusal, count, length, moment} from "./ui.js";
 
 const SHOWN = 12;
-const SEQUENCES = {fast: "fast: fewest frames", standard: "standard", robust: "robust: for what reflects or is hollow"};
+const SEQUENCES = {fast: "fast: fewest frames", standard: "standard", robust: "robust: for what reflects or is hollow", phase: "phase: few frames, in shades of grey"};
 const over = (scan) => !["queued", "capturing", "computing"].includes(scan.state);
 
 export function ScanScreen({rig, may}) {

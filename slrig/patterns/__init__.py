@@ -10,12 +10,22 @@ from slrig.patterns.codes import (
     index_of_word,
     line_positions,
 )
-from slrig.patterns.sequence import SEQUENCES, SequenceOptions, encode, merge_sequences, scan_patterns
+from slrig.patterns.sequence import (
+    SEQUENCES,
+    SequenceOptions,
+    encode,
+    merge_sequences,
+    phase_patterns,
+    scan_patterns,
+)
+from slrig.patterns.sine_positions import SinePosition, sine_periods_px, sine_position_px, sine_turns
+from slrig.patterns.sinusoids import level_lines, require_numbered
 
 __all__ = [
     "MIN_BORDER_DISTANCE_PX",
     "SEQUENCES",
     "SequenceOptions",
+    "SinePosition",
     "cell_centre_px",
     "cell_positions",
     "edge_indices",
@@ -23,7 +33,13 @@ __all__ = [
     "encode",
     "gray_bits",
     "index_of_word",
+    "level_lines",
     "line_positions",
     "merge_sequences",
+    "phase_patterns",
+    "require_numbered",
     "scan_patterns",
+    "sine_periods_px",
+    "sine_position_px",
+    "sine_turns",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, pairwise
@@ -27,6 +28,7 @@ from slrig.model import (
     diagnostic_line_pairs,
 )
 from slrig.patterns.codes import gray_bits, gray_profile, line_profile, sine_profile
+from slrig.patterns.sine_positions import sine_periods_px
 
 GRAY_ONLY_CELL_PX = 2
 """Chosen: without lines edges are all that is measured, and those of cells of 1 px blur into each other."""
@@ -36,9 +38,9 @@ GRAY_ONLY_CELL_PX = 2
 class SequenceOptions:
     """Patterns of a named sequence.
 
-    period_px : of the lines; steps : number of shifts of a period, None for one per pixel. line_width_px : None for
-    half of the period. inverses : True if each bit is followed by its inverse. closing : number of white and black
-    frames at the end.
+    period_px : of the lines, or of the shortest sinusoid; steps : number of shifts of a period, None for one per pixel.
+    line_width_px : None for half of the period. inverses : True if each bit is followed by its inverse. closing :
+    number of white and black frames at the end. sines : True for sinusoids in place of code and lines.
     """
 
     period_px: int
@@ -46,15 +48,21 @@ class SequenceOptions:
     line_width_px: int | None
     inverses: bool
     closing: int
+    sines: bool = False
 
 
 SEQUENCES: Mapping[SequenceName, SequenceOptions] = {
     SequenceName.FAST: SequenceOptions(period_px=6, steps=3, line_width_px=None, inverses=False, closing=0),
     SequenceName.STANDARD: SequenceOptions(period_px=8, steps=None, line_width_px=None, inverses=False, closing=1),
     SequenceName.ROBUST: SequenceOptions(period_px=8, steps=None, line_width_px=None, inverses=True, closing=2),
+    # Four steps: each frame has its inverse, and the harmonics that gamma adds hardly reach the phase. Three take less
+    # time where gamma is known or fitted.
+    SequenceName.PHASE: SequenceOptions(
+        period_px=8, steps=4, line_width_px=None, inverses=False, closing=0, sines=True
+    ),
 }
-"""Chosen by `tests/bench/line_sweep.py` and tested by `tests/bench/fault_campaign.py`; `slrig/scan/README.md` lists
-costs and results.
+"""Chosen by `tests/bench/line_sweep.py` and tested by `tests/bench/fault_campaign.py`;
+`slrig/scan/README.md` lists costs and results.
 """
 
 
@@ -121,10 +129,52 @@ def scan_patterns(
         body += [*first, *(line for line in lines if line not in first)] if not inverses else lines
         body += [each for each in code if each.bit not in telling]
     if coloured_light:
-        gaps = [index for index, pair in enumerate(pairwise(body), 1) if all(isinstance(each, Gray) for each in pair)]
-        for light, index in zip((Primary("blue"), Primary("green"), Primary("red")), reversed(gaps), strict=False):
-            body.insert(index, light)
+        _insert_lights(body)
     return (*reference, *body, *reference[:closing])
+
+
+def phase_patterns(
+    size: Size, *, period_px: float, steps: int | None, rows: bool, columns: bool = True, coloured_light: bool = False
+) -> tuple[Pattern, ...]:
+    """List the patterns of one scan by sinusoids in the order of play.
+
+    White, black; of each requested axis, columns first, three sinusoids in all their shifts, whose periods number every
+    position of the axis; see `sine_periods_px`.
+
+    size : of the projector. period_px : of the shortest sinusoid. steps : shifts of each; None for one per pixel.
+    coloured_light : as of `scan_patterns`.
+
+    Raises PatternError if there are too few steps, or the period is too short.
+
+    >>> patterns = phase_patterns(Size(1280, 800), period_px=12, steps=4, rows=False)
+    >>> len(patterns), patterns[2]
+    (14, Sine(axis=<Axis.COLUMN: 'column'>, period_px=12.0, shift=0, steps=4, kind='sine'))
+    """
+    steps = math.ceil(period_px) if steps is None else steps
+    if steps < MIN_LINE_STEPS:
+        raise PatternError(
+            f"a sinusoid in {steps} steps has no phase: use {MIN_LINE_STEPS} or more; with 4 the projector's gamma "
+            "hardly matters"
+        )
+    body: list[Pattern] = [
+        Sine(axis, each_px, shift, steps)
+        for axis, played in ((Axis.COLUMN, columns), (Axis.ROW, rows))
+        if played
+        for each_px in sine_periods_px(size.along(axis), period_px)
+        for shift in range(steps)
+    ]
+    if coloured_light:
+        _insert_lights(body)
+    return (White(), Black(), *body)
+
+
+def _insert_lights(body: list[Pattern]) -> None:
+    """Insert white in red, green and blue, each between two of the last frames of code or of sinusoids."""
+    gaps = [
+        index for index, pair in enumerate(pairwise(body), 1) if all(isinstance(each, Gray | Sine) for each in pair)
+    ]
+    for light, index in zip((Primary("blue"), Primary("green"), Primary("red")), reversed(gaps), strict=False):
+        body.insert(index, light)
 
 
 def _gray_patterns(axis: Axis, extent_px: int, cell_px: int, offset_px: int, *, inverses: bool) -> list[Gray]:

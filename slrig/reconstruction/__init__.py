@@ -63,6 +63,7 @@ from slrig.reconstruction.redundancy import (
     sheet_coordinates,
 )
 from slrig.reconstruction.second_axis import AxisPositions, axis_residuals, decode_second_axis
+from slrig.reconstruction.sinusoids import SinusoidResponse
 from slrig.reconstruction.triangulation import (
     CONVERGED,
     SheetCurves,
@@ -119,6 +120,7 @@ __all__ = [
     "RefinedPose",
     "RegionMask",
     "SheetCurves",
+    "SinusoidResponse",
     "StripeEnsemble",
     "StripeResiduals",
     "axis_frames",

@@ -241,12 +241,12 @@ def estimate_blur(
 ) -> BlurEstimate:
     """Estimate the blur of the camera from lines, with the expected blur as prior.
 
-    measured : positions by the phase of all line frames; clear : (H, W) bool, pixels away from the borders of shadows;
-    expected_px : blur to expect, and the result if slopes are too even or pixels too few; 0 to accept it as known.
+    measured : positions by the phase of all line frames, or by sinusoids; clear : (H, W) bool, pixels away from the
+    borders of shadows; expected_px : blur to expect, and the result if slopes are too even or pixels too few; 0 to
+    accept it as known.
     """
-    patterns = frames.line_patterns
-    radians_per_px = 2 * np.pi / patterns[0].period_px
-    angle = radians_per_px * np.array([pattern.centre_px for pattern in patterns])
+    images, angle, period_px = frames.phase_frames
+    radians_per_px = 2 * np.pi / period_px
     height, width = measured.position.shape
 
     def shifted(rows: int, columns: int) -> tuple[slice, slice]:
@@ -254,8 +254,8 @@ def estimate_blur(
         return slice(step + rows, height - step + rows, step), slice(step + columns, width - step + columns, step)
 
     inner = shifted(0, 0)
-    lines = np.array([image[inner] for image in frames.lines], dtype=np.float64)
-    amplitude = np.hypot(np.tensordot(np.cos(angle), lines, 1), np.tensordot(np.sin(angle), lines, 1))
+    values = np.array([image[inner] for image in images], dtype=np.float64)
+    amplitude = np.hypot(np.tensordot(np.cos(angle), values, 1), np.tensordot(np.sin(angle), values, 1))
     light = frames.contrast
     contrast = light[inner]
     squared, bend, edge = np.zeros((3, *amplitude.shape))
@@ -268,7 +268,9 @@ def estimate_blur(
     even = known & (edge < _MAX_CONTRAST_STEP * contrast)
     if np.count_nonzero(even) >= _MIN_SAMPLES:
         known = even
-    if expected_px <= 0 or np.count_nonzero(known) < _MIN_SAMPLES:
+    # White and black by the modulation itself do not show what it loses.
+    shows_blur = frames.has_reference or len({each.period_px for each in frames.sine_patterns}) > 1
+    if not shows_blur or expected_px <= 0 or np.count_nonzero(known) < _MIN_SAMPLES:
         return BlurEstimate(expected_px, from_lines=False)
     expected_fall, log_amplitude = -0.5 * radians_per_px**2 * squared[known], np.log(amplitude[known] / contrast[known])
     inliers = np.ones(len(expected_fall), dtype=np.bool_)

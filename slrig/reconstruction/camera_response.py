@@ -39,8 +39,9 @@ from slrig.model import (
     coarse_bit_count,
     diagnostic_bits,
     fit_noise,
+    sine_groups,
 )
-from slrig.reconstruction.frames import AxisFrames, Images, stack_rows, subsample
+from slrig.reconstruction.frames import AxisFrames, Images, sine_weights, stack_rows, subsample
 from slrig.reconstruction.surface_fit import stencils
 
 # Noise.
@@ -120,6 +121,9 @@ def sample_noise(
     where : (H, W) bool, pixels to sample; None for all.
     """
     coarse_count, lines = coarse_bit_count(len(frames.bits)), frames.line_pairs
+    has_pairs = frames.inverses is not None and len(frames.bits) >= _MIN_BITS
+    if len(frames.sinusoids) and not has_pairs:
+        return _scatter_of_sinusoids(frames, where)
     if frames.inverses is not None and len(frames.bits) >= _MIN_BITS:
         level, variance = _scatter_of_sums(
             frames.bits[:coarse_count], frames.inverses[:coarse_count], frames.clipped_at, where
@@ -159,6 +163,35 @@ def _scatter_of_sums(
     # The median of a bin is below the mean of a chi-square distribution (Wilson-Hilferty).
     variance = variance / (1 - 2 / (9 * count)) ** 3
     return sums.mean(axis=0)[unclipped] / 2, (variance[unclipped] / 2).astype(np.float32)
+
+
+def _scatter_of_sinusoids(
+    frames: AxisFrames, where: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Levels and variances of single samples: the mean of all shifts of a period is free of stripes.
+
+    The means of two periods are alike. Those of one period scatter between neighbouring pixels, and so do white and
+    black.
+    """
+    unclipped = np.ones(frames.white.shape, dtype=np.bool_) if where is None else where.copy()
+    for image in frames.sinusoids:
+        unclipped &= (image < frames.clipped_at) & (image > 0)
+    means, gains = [], []
+    for members in sine_groups(frames.sine_patterns):
+        weights = sine_weights([frames.sine_patterns[i] for i in members])[0].astype(np.float32)
+        means.append(np.sum([w * frames.sinusoids[i] for w, i in zip(weights, members, strict=True)], axis=0))
+        gains.append(float(weights @ weights))
+    if len(means) > 1:
+        step = max(1, int(np.count_nonzero(unclipped)) // _MAX_SAMPLES)
+        first, last = (each[unclipped][::step] for each in (means[0], means[-1]))
+        samples = gains[0] + gains[-1]
+        return (first + last) / 2, (first - last) ** 2 / np.float32(samples * _MEDIAN_SQUARE)
+    alone = replace(frames, reference_repeats=1 / gains[0])
+    level, variance = _scatter_between_neighbours(alone, unclipped, means[0])
+    if not frames.has_reference:
+        return level, variance
+    ends, of_ends = _scatter_between_neighbours(frames, where, frames.white, frames.black)
+    return np.concatenate([level, ends]), np.concatenate([variance, of_ends])
 
 
 def _scatter_of_lines(
@@ -334,7 +367,19 @@ def phase_pixel_sum(frames: AxisFrames, lit: NDArray[np.bool_]) -> PixelSum:
     (here, known), (below, known_below) = above(0), above(1)
     across = cycles_per_px(here[:, 1:], here[:, :-1], known[:, 1:] & known[:, :-1])
     down = cycles_per_px(here, below, known & known_below)
-    return PixelSum(stencils()[0][0, :25].reshape(5, 5).astype(np.float64), (across, down))
+    return PixelSum(_fit_weights(), (across, down))
+
+
+def sinusoid_pixel_sum(position: NDArray[np.float32], period_px: float) -> PixelSum:
+    """Weights of the fit to positions by sinusoids. position : (H, W) float32, projector px, NaN where unknown."""
+    across, down = (np.abs(np.diff(position, axis=axis)) for axis in (1, 0))
+    cycles = [float(np.nanmedian(each)) / period_px if np.isfinite(each).any() else 0.0 for each in (across, down)]
+    return PixelSum(_fit_weights(), (cycles[0], cycles[1]))
+
+
+def _fit_weights() -> FloatArray:
+    """(5, 5) float64: weights of the pixels in the fit of a surface to positions."""
+    return stencils()[0][0, :25].reshape(5, 5).astype(np.float64)
 
 
 def edge_pixel_sum(scale_px: float) -> PixelSum:
@@ -556,6 +601,7 @@ def frame_compression_loss(frames: AxisFrames, lit: NDArray[np.bool_], images: I
     searched = direct + (lines[1] if lines is not None else [])
     if frames.inverses is not None:
         searched += [frames.inverses[bit] for bit in bits]
+    searched = searched or list(frames.sinusoids)
     return compression_loss(direct if images is None else images, searched, lit, frames.full_scale)
 
 

@@ -29,6 +29,7 @@ from slrig.reconstruction.frames import (
     subsample,
 )
 from slrig.reconstruction.phase import EdgeLimits, near_shadows
+from slrig.reconstruction.sinusoids import SinusoidMap
 from slrig.reconstruction.stripes import (
     LinePoints,
     StripeLimits,
@@ -58,12 +59,20 @@ class CodeTables:
     index_of_word : (2^bits,) int32; cell_position : (cells,) float64, px; position_table : (frames, cells) float64, px,
     of lines or of code edges; edge_table : (bits, cells) float64, px, of the code edges that replace unresolved lines,
     None to replace none.
+
+    For sinusoids, cells are single projector positions, whichever cells the code has, and the position table is that
+    of the levels of the position map, which are lines one projector px apart.
     """
 
     index_of_word: IntArray
     cell_position: FloatArray
     position_table: FloatArray
     edge_table: FloatArray | None = None
+
+    @property
+    def extent_px(self) -> int:
+        """Extent of the projector where cells are single positions."""
+        return len(self.cell_position)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +97,8 @@ class DecodedImage:
 
     code : lit pixels and, once it is read, their interval of cells (`CodeMap`). near_shadow : (H, W) bool, pixels too
     close to a shadow for a fit; contrast_deviation : (H, W) float32, standard deviation of white minus black by noise;
-    unresolved : as in `CameraCurves`; region : (H, W) bool, the scan region, None for all.
+    unresolved : as in `CameraCurves`; region : (H, W) bool, the scan region, None for all. sinusoids : positions by
+    sinusoids, whose cells `code` has; None without.
     """
 
     frames: AxisFrames
@@ -98,6 +108,7 @@ class DecodedImage:
     contrast_deviation: NDArray[np.float32]
     unresolved: NDArray[np.uint8] | None = None
     region: NDArray[np.bool_] | None = None
+    sinusoids: SinusoidMap | None = None
 
     def rows(self, rows: slice) -> DecodedImage:
         """Select rows of all images."""
@@ -224,7 +235,7 @@ def light_from_surfaces(decoded: DecodedImage) -> tuple[float, float]:
     """
     frames, step = decoded.frames, math.ceil(math.sqrt(decoded.frames.white.size / _MAX_SAMPLES))
     lit = decoded.search_mask[::step, ::step]
-    if not lit.any():
+    if not (lit.any() and len(frames.bits)):
         return 0.0, 0.0
     stacks = [frames.bits] if frames.inverses is None else [frames.bits, frames.inverses]
     values = np.concatenate([subsample(images, step, step) for images in stacks])

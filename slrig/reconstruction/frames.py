@@ -22,16 +22,19 @@ from slrig.model import (
     Axis,
     Black,
     Capture,
+    FloatArray,
     Gray,
     IntArray,
     LineShift,
     Pattern,
     Shot,
+    Sine,
     White,
     diagnostic_bits,
     diagnostic_line_pairs,
     exposure_groups,
     has_even_shifts,
+    sine_groups,
 )
 
 Image = NDArray[np.float32]
@@ -120,7 +123,11 @@ class AxisFrames:
     bits : B images, most significant first; inverses : the same, or None without. lines : L images, one per shift, of
     the patterns line_patterns. full_scale : value of a saturated sample of one exposure. reference_repeats : number of
     frames that white and black are means of, over that of the others. exposure_ratio : light of the longest exposure of
-    a bracket over that of its shortest; 1 without a bracket. sample_step : as in `SampleFormat`.
+    a bracket over that of its shortest; 1 without a bracket. sample_step : as in `SampleFormat`. sinusoids : images of
+    the patterns sine_patterns. has_reference : False if white and black are level plus and minus modulation of
+    sinusoids.
+
+    Without Gray code there are no bits, and `gray` has cells of one position.
     """
 
     axis: Axis
@@ -135,6 +142,9 @@ class AxisFrames:
     exposure_ratio: float = 1.0
     reference_repeats: float = 1.0
     sample_step: float = 1.0
+    sinusoids: Images = ()
+    sine_patterns: tuple[Sine, ...] = ()
+    has_reference: bool = True
 
     @property
     def clipped_at(self) -> float:
@@ -154,6 +164,20 @@ class AxisFrames:
     def lines_light_half(self) -> bool:
         """True if the mean of the lines is the middle of white and black: see `lights_half_period`."""
         return len(self.lines) > 0 and lights_half_period(self.line_patterns)
+
+    @property
+    def phase_frames(self) -> tuple[Images, FloatArray, float]:
+        """Frames whose first harmonic shows the position: images, phase of each in radians, and their period, px.
+
+        They are the lines, or the sinusoids of the finest period with three shifts.
+        """
+        if len(self.lines):
+            period_px = self.line_patterns[0].period_px
+            return self.lines, 2 * np.pi / period_px * np.array([p.centre_px for p in self.line_patterns]), period_px
+        members = sine_groups(self.sine_patterns)[0]
+        patterns = [self.sine_patterns[i] for i in members]
+        angle = 2 * np.pi * np.array([p.shift / p.steps for p in patterns])
+        return [self.sinusoids[i] for i in members], angle, patterns[0].period_px
 
     @property
     def middle(self) -> Image:
@@ -187,6 +211,7 @@ class AxisFrames:
             bits=[image[rows] for image in self.bits],
             inverses=None if self.inverses is None else [image[rows] for image in self.inverses],
             lines=[image[rows] for image in self.lines],
+            sinusoids=[image[rows] for image in self.sinusoids],
         )
 
 
@@ -194,8 +219,9 @@ class AxisFrames:
 class AxisPatterns:
     """Patterns of one axis that one camera captures, in the order for decoding.
 
-    gray : the code, as its first bit; direct, inverted : bits shown so; lines : by shift; reference : White and Black,
-    as far as they are shown.
+    gray : the code, as its first bit, or cells of one position without; direct, inverted : bits shown so; lines : by
+    shift; reference : White and Black, as far as they are shown. sines : of sinusoids, by period and shift; none beside
+    lines.
     """
 
     gray: Gray
@@ -203,6 +229,12 @@ class AxisPatterns:
     inverted: frozenset[int]
     lines: tuple[LineShift, ...]
     reference: frozenset[White | Black]
+    sines: tuple[Sine, ...] = ()
+
+    @property
+    def has_code(self) -> bool:
+        """True if there is a Gray code."""
+        return bool(self.direct or self.inverted)
 
     @property
     def has_inverses(self) -> bool:
@@ -214,8 +246,10 @@ class AxisPatterns:
         """Patterns to estimate noise and response of the camera from.
 
         With inverses, white and black these are `diagnostic_bits`; without inverses `diagnostic_line_pairs`, or else
-        lines of half their period and some bits; otherwise the whole code.
+        lines of half their period and some bits; otherwise the whole code. With sinusoids these are all patterns.
         """
+        if self.sines:
+            return self.required
         if len(self.reference) == 2:
             pairs = diagnostic_line_pairs(self.lines)
             bits = [replace(self.gray, bit=bit) for bit in diagnostic_bits(self.gray.bits)]
@@ -229,7 +263,7 @@ class AxisPatterns:
     @property
     def code_patterns(self) -> frozenset[Pattern]:
         """Patterns that the code is read from."""
-        if self.lines_light_half and not self.has_inverses:
+        if self.sines or (self.lines_light_half and not self.has_inverses):
             return self.required
         return frozenset(each for each in self.required if not isinstance(each, LineShift))
 
@@ -243,7 +277,7 @@ class AxisPatterns:
         """Patterns whose images decoding uses."""
         direct = (replace(self.gray, bit=bit) for bit in self.direct)
         inverted = (replace(self.gray, bit=bit, inverted=True) for bit in self.inverted)
-        return frozenset((*self.reference, *direct, *inverted, *self.lines))
+        return frozenset((*self.reference, *direct, *inverted, *self.lines, *self.sines))
 
 
 def axis_patterns(patterns: Collection[Pattern], camera: str, axis: Axis) -> AxisPatterns:
@@ -252,9 +286,15 @@ def axis_patterns(patterns: Collection[Pattern], camera: str, axis: Axis) -> Axi
     Raises
     ------
     PatternError
-        Bits are missing or of two codes, or there is neither a white-black pair nor inverses to threshold with.
+        Bits are missing or of two codes, or there is neither a white-black pair nor inverses to threshold with. No
+        period of sinusoids has three shifts.
     """
     grays = [p for p in patterns if isinstance(p, Gray) and p.axis is axis]
+    lines = tuple(sorted((p for p in patterns if isinstance(p, LineShift) and p.axis is axis), key=lambda p: p.shift))
+    sines = () if lines else _sines(patterns, camera, axis)
+    reference = frozenset(p for p in patterns if isinstance(p, White | Black))
+    if sines and not grays:
+        return AxisPatterns(Gray(axis, 0, 1), frozenset(), frozenset(), (), reference, sines)
     if not grays:
         message = (
             f"camera '{camera}' has no Gray-code frames of the {axis.value} axis; a scan needs them to number lines"
@@ -277,18 +317,30 @@ def axis_patterns(patterns: Collection[Pattern], camera: str, axis: Axis) -> Axi
             "shoot them again or lower the number of bits"
         )
         raise PatternError(message)
-    reference = frozenset(p for p in patterns if isinstance(p, White | Black))
-    if len(reference) < 2 and not direct & inverted:
+    if len(reference) < 2 and not (direct & inverted or sines):
         message = (
             f"camera '{camera}' has no white and black frames and no bit with its inverse: "
             "bits have no threshold; add a white and a black frame, or inverses"
         )
         raise PatternError(message)
-    lines = tuple(sorted((p for p in patterns if isinstance(p, LineShift) and p.axis is axis), key=lambda p: p.shift))
     if len({(p.period_px, p.line_width_px) for p in lines}) > 1:
         message = f"camera '{camera}' has line-shift frames of two periods or widths on the {axis.value} axis; keep one"
         raise PatternError(message)
-    return AxisPatterns(Gray(axis, 0, first.bits, first.cell_px, first.offset_px), direct, inverted, lines, reference)
+    gray = Gray(axis, 0, first.bits, first.cell_px, first.offset_px)
+    return AxisPatterns(gray, direct, inverted, lines, reference, sines)
+
+
+def _sines(patterns: Collection[Pattern], camera: str, axis: Axis) -> tuple[Sine, ...]:
+    """Sinusoids of an axis, by period and shift. Raises PatternError: none of their periods has three shifts."""
+    found = [p for p in patterns if isinstance(p, Sine) and p.axis is axis]
+    sines = tuple(sorted(found, key=lambda p: (p.period_px, p.shift / p.steps)))
+    if sines and not sine_groups(sines):
+        message = (
+            f"camera '{camera}' has {len(sines)} frames of sinusoids of the {axis.value} axis, and no period has "
+            "three shifts, which brightness, modulation and phase need; play three shifts of one period at least"
+        )
+        raise PatternError(message)
+    return sines
 
 
 def lights_half_period(lines: Sequence[LineShift], /) -> bool:
@@ -308,7 +360,7 @@ def used_frames(patterns: Sequence[Pattern], exposures_s: Sequence[float | None]
     processed as it comes; those that close the sequence are not. If patterns are repeated or bracketed, or the sequence
     does not open with white and black, all are used.
     """
-    bodies = [i for i, p in enumerate(patterns) if isinstance(p, Gray | LineShift)]
+    bodies = [i for i, p in enumerate(patterns) if isinstance(p, Gray | LineShift | Sine)]
     once = len({patterns[i] for i in bodies}) == len(bodies) and exposure_count(exposures_s) <= 1
     if not (once and bodies and {White(), Black()} <= set(patterns[: bodies[0]])):
         return [True] * len(patterns)
@@ -342,11 +394,12 @@ class FrameStacks:
             "reference_repeats": reference_repeats,
             "sample_step": 1.0,
         }
-        bits = patterns.gray.bits
+        bits = patterns.gray.bits if patterns.has_code else 0
         dark = np.broadcast_to(np.zeros(1, dtype=np.uint8), shape)
         self._bits: list[NDArray[Any]] = [dark] * bits
         self._inverses: list[NDArray[Any]] = [dark] * (bits if patterns.inverted else 0)
         self._lines: list[NDArray[Any]] = [dark] * len(patterns.lines)
+        self._sinusoids: list[NDArray[Any]] = [dark] * len(patterns.sines)
         self._reference: dict[Pattern, Image] = {}
         self._missing = set(patterns.required)
         self._gamma = 1.0
@@ -355,18 +408,19 @@ class FrameStacks:
     @classmethod
     def from_frames(cls, frames: AxisFrames) -> FrameStacks:
         """Return the stacks of a complete set of frames."""
-        bits = frozenset(range(frames.gray.bits))
+        bits = frozenset(range(len(frames.bits)))
         stacks = cls(
             AxisPatterns(
                 frames.gray, bits, bits if frames.inverses is not None else frozenset(), frames.line_patterns,
-                frozenset((White(), Black())),
+                frozenset((White(), Black())) if frames.has_reference else frozenset(), frames.sine_patterns,
             ),
             (0, 0), full_scale=frames.full_scale, exposure_ratio=frames.exposure_ratio,
             reference_repeats=frames.reference_repeats,
         )  # fmt: skip
         stacks._bits, stacks._lines = list(frames.bits), list(frames.lines)
+        stacks._sinusoids = list(frames.sinusoids)
         stacks._inverses = [] if frames.inverses is None else list(frames.inverses)
-        stacks._reference = {White(): frames.white, Black(): frames.black}
+        stacks._reference = {White(): frames.white, Black(): frames.black} if frames.has_reference else {}
         stacks._missing = set()
         stacks._scales["sample_step"] = frames.sample_step
         stacks._is_format_known = True
@@ -384,6 +438,8 @@ class FrameStacks:
             (self._inverses if pattern.inverted else self._bits)[pattern.bit] = image
         elif isinstance(pattern, LineShift):
             self._lines[self.patterns.lines.index(pattern)] = image
+        elif isinstance(pattern, Sine):
+            self._sinusoids[self.patterns.sines.index(pattern)] = image
         else:
             self._reference[pattern] = image.astype(np.float32)
         self._missing.discard(pattern)
@@ -391,10 +447,11 @@ class FrameStacks:
     def release_line_images(self) -> None:
         """Drop the line images, those of returned frames included."""
         self._lines.clear()
+        self._sinusoids.clear()
 
     def release(self) -> None:
         """Drop the images of code and lines, those of returned frames included."""
-        for images in (self._bits, self._inverses, self._lines):
+        for images in (self._bits, self._inverses, self._lines, self._sinusoids):
             images.clear()
 
     def linearise(self, gamma: float) -> None:
@@ -403,7 +460,7 @@ class FrameStacks:
         gamma : values are light to the power of 1/gamma.
         """
         self._gamma = gamma
-        for images in (self._bits, self._inverses, self._lines):
+        for images in (self._bits, self._inverses, self._lines, self._sinusoids):
             images[:] = [self._linearise_image(each) for each in images]
         self._reference = {pattern: self._linearise_image(image) for pattern, image in self._reference.items()}
 
@@ -436,6 +493,9 @@ class FrameStacks:
         pairs = sorted(patterns.direct & patterns.inverted)
         white, black = self._reference.get(White()), self._reference.get(Black())
         both = [each for bit in pairs for each in (self._bits[bit], self._inverses[bit])]
+        has_reference = bool(both) or (white is not None and black is not None)
+        if not has_reference:
+            white, black = _brightest_and_darkest(self._sinusoids, patterns.sines)
         if white is None:
             white = reduce(np.maximum, both).astype(np.float32)
         if black is None:
@@ -451,6 +511,9 @@ class FrameStacks:
             gray=patterns.gray,
             lines=self._lines,
             line_patterns=patterns.lines,
+            sinusoids=self._sinusoids,
+            sine_patterns=patterns.sines,
+            has_reference=has_reference,
             **self._scales,
         )
 
@@ -460,9 +523,27 @@ class FrameStacks:
             return
         self._is_format_known = True
         used = [each for each in self.patterns.noise_patterns if isinstance(each, Gray)]
-        images = [(self._inverses if each.inverted else self._bits)[each.bit] for each in used]
+        images = [(self._inverses if each.inverted else self._bits)[each.bit] for each in used] + self._sinusoids
         step, full_scale = sample_format(images, self._scales["full_scale"])
         self._scales |= {"sample_step": step, "full_scale": full_scale}
+
+
+def sine_weights(patterns: Sequence[Sine], /) -> FloatArray:
+    """(3, n) float64: weights of frames of one period for level, and cosine and sine part of the modulation."""
+    angle = 2 * np.pi * np.array([each.shift / each.steps for each in patterns])
+    return np.asarray(np.linalg.pinv(np.stack([np.ones(len(angle)), np.cos(angle), np.sin(angle)], axis=1)))
+
+
+def _brightest_and_darkest(images: Images, patterns: Sequence[Sine]) -> tuple[Image, Image]:
+    """Level plus and minus modulation of the coarsest period with three shifts, which blur reduces least."""
+    members = sine_groups(patterns)[-1]
+    weights = sine_weights([patterns[i] for i in members]).astype(np.float32)
+    level, cosine, sine = np.zeros((3, *images[0].shape), dtype=np.float32)
+    for index, i in enumerate(members):
+        for part, weight in zip((level, cosine, sine), weights[:, index], strict=True):
+            part += weight * images[i]
+    swing = np.hypot(cosine, sine)
+    return level + swing, np.maximum(level - swing, 0)
 
 
 def axis_frames(capture: Capture, camera: str, axis: Axis) -> AxisFrames:
@@ -505,7 +586,7 @@ def used_shots(capture: Capture, camera: str) -> list[Shot]:
 def reference_repeats(patterns: Sequence[Pattern], axis: Axis) -> float:
     """Number of frames that white and black are means of, over that of the other patterns; 1 if any are missing."""
     counts = Counter(patterns)
-    others = [n for p, n in counts.items() if isinstance(p, Gray | LineShift) and p.axis is axis]
+    others = [n for p, n in counts.items() if isinstance(p, Gray | LineShift | Sine) and p.axis is axis]
     return max(1.0, min(counts[White()], counts[Black()]) / max(others, default=1))
 
 

@@ -300,6 +300,8 @@ def asymmetry_sigma_px(
     changes sharply, as `centred` (from `resample_to_pixel_centres`) tells, say nothing: it makes lines asymmetric, too.
     """
     patterns = frames.line_patterns
+    if not patterns:  # sinusoids have no harmonics
+        return np.zeros(usable.shape, dtype=np.float32)
     period_px, width_px, count = patterns[0].period_px, patterns[0].line_width_px, len(patterns)
     amplitudes = {order: np.sin(np.pi * order * width_px / period_px) for order in (2, 3) if 2 * order < count}
     order = next((each for each, amplitude in amplitudes.items() if abs(amplitude) > _MIN_HARMONIC), None)

@@ -25,7 +25,12 @@ from numpy.typing import NDArray
 from slrig.errors import PatternError
 from slrig.model import FloatArray, IntArray, NoiseModel, Pattern, Refusal
 from slrig.reconstruction.blur import correct_curvature, estimate_blur
-from slrig.reconstruction.camera_response import CameraResponse, edge_pixel_sum, phase_pixel_sum
+from slrig.reconstruction.camera_response import (
+    CameraResponse,
+    edge_pixel_sum,
+    phase_pixel_sum,
+    sinusoid_pixel_sum,
+)
 from slrig.reconstruction.decoded_image import (
     CodeTables,
     DecodedImage,
@@ -57,6 +62,7 @@ from slrig.reconstruction.identification import (
     mark_refused_pixels,
 )
 from slrig.reconstruction.phase import (
+    PositionMap,
     asymmetry_sigma_px,
     centroid_residual_px,
     line_step_px,
@@ -68,6 +74,7 @@ from slrig.reconstruction.phase import (
     step_sigma_px,
 )
 from slrig.reconstruction.refinement import refine_points
+from slrig.reconstruction.sinusoids import SinusoidResponse, locate_sinusoids
 from slrig.reconstruction.stripes import LinePoints, StripeLimits, chain_stripes, stripe_points, stripe_width_px
 
 # Chosen: at 0.7 px, narrow stripes are found with three times the error.
@@ -89,7 +96,8 @@ class CameraCurves:
     unresolved : (H, W) uint8, number of finest bits left out at each pixel; None where bits only number lines.
     unresolved_lines : (H, W) bool, where code edges replace lines that the camera does not resolve; None if nowhere.
     compression_dn : standard deviation of white noise that displaces positions as much as the loss by compression; 0
-    for frames without loss. noise_correlation, gamma : as in `camera_response.CameraResponse`. beyond_pixels : number
+    for frames without loss. noise_correlation, gamma : as in `camera_response.CameraResponse`. sinusoids : how light
+    follows the values of sinusoids, None without. beyond_pixels : number
     of pixels whose code names a cell that the projector has not; furthest_cell : of these cells, the one farthest from
     the projector's that more than a hundredth of the pixels name, -1 without any. light_from_surfaces : as
     `decoded_image.light_from_surfaces` returns it. clipped_white, clipped_code : number of lit pixels that are clipped
@@ -110,6 +118,7 @@ class CameraCurves:
     compression_dn: float = 0.0
     noise_correlation: float = 1.0
     gamma: float = 1.0
+    sinusoids: SinusoidResponse | None = None
     beyond_pixels: int = 0
     furthest_cell: int = -1
     light_from_surfaces: tuple[float, float] = (0.0, 0.0)
@@ -226,10 +235,11 @@ class CameraStream:
         self._has_code = True
         frames, tables = image.frames, self._tables
         unresolved = None
-        given = (
-            frames, image.response.noise, tables.index_of_word, len(tables.cell_position), self._limits.decoding
-        )  # fmt: skip
-        if self._stacks.patterns.lines:
+        given = frames, image.response.noise, tables.index_of_word, _cell_count(frames, tables), self._limits.decoding
+        if frames.sine_patterns:
+            image = _locate_by_sinusoids(image, decode(*given) if len(frames.bits) else image.code, tables)
+            code = image.code
+        elif self._stacks.patterns.lines:
             code = decode(*given)
         else:
             code, unresolved = decode_edges(*given)
@@ -241,6 +251,10 @@ class CameraStream:
 
     def _locate_stripes(self, image: DecodedImage) -> DecodedImage:
         """Find the points of the line frames that are there, or of all code edges."""
+        if self._stacks.patterns.sines:
+            self._scale = _FilterScale(_MIN_SCALE_PX, _MIN_SCALE_PX, sampled=True)
+            self._points = [_no_points() for _ in self._tables.position_table]
+            return image
         if self._scale is None and not self._stacks.patterns.lines:
             self._report_step("locate stripes")
             scale_px = self._limits.stripes.filter_px or _MIN_SCALE_PX
@@ -275,6 +289,33 @@ class CameraStream:
         return _FilterScale(filter_px, blur_px, sampled, rows if sampled else _ALL_ROWS)
 
 
+def _locate_by_sinusoids(image: DecodedImage, code: CodeMap, tables: CodeTables) -> DecodedImage:
+    """Measure positions by sinusoids, within the cells of the code if there is one."""
+    frames, noise = image.frames, image.response.noise
+    found = locate_sinusoids(frames, noise, code, tables.extent_px)
+    period_px = frames.phase_frames[2]
+    image = replace(image, code=found.code).with_position_noise(
+        frames.sinusoids, sinusoid_pixel_sum(found.measured.position, period_px)
+    )
+    middle = np.asarray(frames.white + frames.black, dtype=np.float32) / np.float32(2)
+    wider = np.sqrt(np.divide(image.position_noise.variance(middle), noise.variance(middle)))
+    return replace(
+        image, sinusoids=found._replace(measured=found.measured._replace(sigma=found.measured.sigma * wider))
+    )
+
+
+def _cell_count(frames: AxisFrames, tables: CodeTables) -> int:
+    """Number of cells of the code."""
+    if not frames.sine_patterns:
+        return len(tables.cell_position)
+    return (tables.extent_px - 1 + frames.gray.offset_px) // frames.gray.cell_px + 1
+
+
+def _no_points() -> LinePoints:
+    empty = np.zeros((0, 2))
+    return LinePoints(empty, empty, np.zeros(0), np.zeros(0, dtype=np.bool_), np.zeros(0))
+
+
 @dataclass(frozen=True, slots=True)
 class AlignedPoints:
     """Points of each line frame, or of each bit, and the code with the causes of refused pixels.
@@ -304,12 +345,17 @@ def align_points(
     """
     frames, code, disagreement_px, points = image.frames, image.code, np.zeros(0), found
     frame_sigma_px = np.zeros(len(found))
-    measured = position_map(frames, image.position_noise, code, tables.cell_position)
     resolution_px = cell_width_px(image)
-    step_px = line_step_px(frames.line_patterns)
+    step_px: int | None
+    if image.sinusoids is not None:
+        position, sigma = image.sinusoids.measured
+        measured, step_px = PositionMap(np.where(code.refusal == 0, position, np.float32(np.nan)), sigma), 1
+    else:
+        measured = position_map(frames, image.position_noise, code, tables.cell_position)
+        step_px = line_step_px(frames.line_patterns)
     if step_px is not None:
         resolution_px = 0.0
-        period_px = frames.line_patterns[0].period_px
+        _, _, period_px = frames.phase_frames
         blur_px, from_lines = estimate_blur(frames, measured, ~image.near_shadow, limits.camera_blur_px)
         near_shadow = near_shadows_by_blur(blur_px, image.near_shadow, image.unlit, limits.edges)
         prints = None if from_lines else ~near_shadow
@@ -333,10 +379,14 @@ def align_points(
         refinement = refine_points(
             found, measured, usable, code, tables.position_table, step_px, extra_sigma_px=extra_sigma_px,
             max_disagreement_px=limits.max_disagreement_px, sampled=sampled, release_lines=release_lines,
+            **({} if image.sinusoids is None else {"start_sigma_px": np.inf}),
         )  # fmt: skip
         points, disagreement_px, frame_sigma_px = (
             refinement.points, refinement.disagreement_px, refinement.frame_sigma_px
         )  # fmt: skip
+        if image.sinusoids is not None:
+            # The levels are of all frames together.
+            disagreement_px = np.zeros(0)
         if refinement.accepted:
             return AlignedPoints(points, marked, near_shadow, near_step, True, disagreement_px, frame_sigma_px)
     # A fit leaves out pixels of mixed light; the window of a filter has to be clear of them.
@@ -418,6 +468,7 @@ def _refine_identify_link(
     """
     frames, from_surfaces = image.frames, light_from_surfaces(image)
     beyond = cells_beyond(frames, image.code, tables.index_of_word)
+    cell_count = _cell_count(frames, tables)
     clipped_white, clipped_code = _count_clipped(frames, ~image.unlit)
     report_step("refine stripes")
     aligned = align_points(
@@ -437,7 +488,7 @@ def _refine_identify_link(
         points, code, tables.position_table, near_shadow, near_step, shortest
     )  # fmt: skip
     without_lines = None
-    if tables.edge_table is not None:
+    if tables.edge_table is not None and frames.line_patterns:
         per_cell = len(points) * frames.gray.cell_px / frames.line_patterns[0].period_px
         clear = ~(near_shadow | near_step) & (True if image.region is None else image.region)
         without_lines = unresolved_lines(numbered.stripes.points_px, image.code, clear, per_cell)
@@ -481,8 +532,9 @@ def _refine_identify_link(
         compression_dn=float(np.sqrt(image.response.loss_variance)),
         noise_correlation=image.response.noise_correlation,
         gamma=image.response.gamma,
+        sinusoids=None if image.sinusoids is None else image.sinusoids.response,
         beyond_pixels=len(beyond),
-        furthest_cell=_furthest_cell(beyond, len(tables.cell_position)),
+        furthest_cell=_furthest_cell(beyond, cell_count),
         light_from_surfaces=from_surfaces,
         clipped_white=clipped_white,
         clipped_code=clipped_code,
@@ -505,7 +557,7 @@ def _count_clipped(frames: AxisFrames, lit: NDArray[np.bool_]) -> tuple[int, int
     if not count:
         return 0, 0
     in_code = np.zeros_like(lit)
-    for each in (*frames.bits, *(frames.inverses or ())):
+    for each in (*frames.bits, *(frames.inverses or ()), *frames.sinusoids):
         in_code |= each >= frames.clipped_at
     return count, int(np.count_nonzero(in_code & lit))
 

@@ -24,7 +24,7 @@ from slrig.reconstruction.phase import FittedPoints, PositionMap, allocate_point
 from slrig.reconstruction.stripes import LinePoints
 from slrig.reconstruction.surface_fit import MIN_GRADIENT, MIN_POINTS, fit_kernel
 
-_MAX_START_SIGMA_PX = 0.15  # a chain may begin at a point that the filter missed if its standard deviation is smaller
+_MAX_START_SIGMA_PX = 0.15  # of points that the filter missed: others are there to begin at
 _MISSED_STRENGTH = 1e-6  # of points that the filter missed: far below its response, so that its points come first
 _CORRELATED_POINTS = 5  # whose errors a filter correlates along the stripe: 2√π of its scale, 4.3 points at 1.2 px
 _BORDER_PX = 0.12  # closer to the border of a pixel, another fit might end beyond it
@@ -211,6 +211,7 @@ def refine_points(
     coarsest_px: float = 0.5,
     max_disagreement_px: float = np.inf,
     sampled: bool = False,
+    start_sigma_px: float = _MAX_START_SIGMA_PX,
     release_lines: Callable[[], None] = lambda: None,
 ) -> Refinement:
     """Refine the points of all line frames of one axis. Empties `found`.
@@ -219,7 +220,8 @@ def refine_points(
     coarsest_px pixels. position_table : (frames, cells) float64, as for `identify_stripes`; step_px : from the lines of
     one frame to those of the next. extra_sigma_px : (H, W), standard deviation of errors that the scatter of pixels
     does not show; added in squares. sampled : `found` are some of the points, to check that the light was the same in
-    all frames, and all points come from the position map. release_lines : called if it was, before the largest
+    all frames, and all points come from the position map. start_sigma_px : a chain may begin at a point that the filter
+    missed if its standard deviation is smaller. release_lines : called if it was, before the largest
     allocation.
     """
     borders = np.concatenate([[0], np.cumsum([len(each.points_px) for each in found], dtype=np.int64)])
@@ -273,7 +275,9 @@ def refine_points(
     def merge(first: int, last: int) -> None:
         # In place, to release the memory of its parts.
         for index in range(first, last):
-            found[index] = _merge_points(found[index], refined, parts[index], added, new_parts[index], extra_sigma_px)
+            found[index] = _merge_points(
+                found[index], refined, parts[index], added, new_parts[index], extra_sigma_px, start_sigma_px
+            )  # fmt: skip
 
     in_bands(merge, len(found))
     merged = found.copy()
@@ -284,7 +288,7 @@ def refine_points(
 
 def _merge_points(
     points: LinePoints, refined: FittedPoints, part: slice, added: FittedPoints, new_part: slice,
-    extra_sigma_px: NDArray[np.float32] | None,
+    extra_sigma_px: NDArray[np.float32] | None, start_sigma_px: float,
 ) -> LinePoints:  # fmt: skip
     """Valid points of one frame: those of the filter, and those that it missed."""
     valid, new_valid = refined.found[part], added.found[new_part]
@@ -298,7 +302,7 @@ def _merge_points(
     np.compress(valid, points.strong, out=strong[:first])
     # Chains begin at points of the filter; points that it missed come after, the most accurate first.
     strength[first:] = _MISSED_STRENGTH / out[2][first:]
-    strong[first:] = out[2][first:] < _MAX_START_SIGMA_PX
+    strong[first:] = out[2][first:] < start_sigma_px
     sigma_px = out[2]
     if extra_sigma_px is not None:
         columns, rows = np.rint(out[0]).astype(np.intp).T

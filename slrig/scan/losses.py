@@ -316,5 +316,5 @@ def fitting_poses(cameras: Sequence[CameraResult], projector: Pinhole, axis: Axi
 
 
 def code_of(patterns: Collection[Pattern], axis: Axis) -> Gray:
-    """Return a bit of the code of an axis."""
-    return next(each for each in patterns if isinstance(each, Gray) and each.axis is axis)
+    """Return a bit of the code of an axis; of sinusoids that number themselves, one of cells of one position."""
+    return next((each for each in patterns if isinstance(each, Gray) and each.axis is axis), Gray(axis, 0, 1))

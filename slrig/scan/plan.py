@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import datetime, timedelta
 from typing import Protocol
 from uuid import UUID
@@ -12,6 +12,11 @@ from slrig.bundle import TurnedBy
 from slrig.errors import ConfigError, setting
 from slrig.model import Axis, FlipRule, Region, SequenceName, bracket_fault
 from slrig.patterns import SEQUENCES, SequenceOptions
+
+_OF_LINES = (
+    "line_shift", "line_shift_period_px", "line_steps", "line_width_px", "gray_cell_px", "gray_offset_px", "inverses",
+)  # fmt: skip
+_OF_SINES = ("sine_period_px", "sine_steps")
 
 MOST_TURN_DEG = 3600.0
 """Ten turns either way: more is a slip, and winds up the cables of what stands on a turntable."""
@@ -33,6 +38,7 @@ class PatternPlan:
     Gray-only scan. line_shift_period_px : n. line_steps : the number of line frames; None stands for that of the
     sequence, or the next number that divides n. line_width_px : of a line.
     gray_cell_px : None stands for ⌊n/2⌋, so that a code edge may be off by n/4 px, or without lines for 2.
+    sine_period_px : of the shortest sinusoid of the sequence `phase`; sine_steps : shifts of each.
     inverses : each bit is followed by its inverse; None stands for True unless lines of half their period prove bits.
     rows : True plays columns and rows, False columns alone, and None what the calibration asks for: columns for
     devices side by side, rows for devices above one another; see `slrig.scan.light_axis.played_axes`. codes : False
@@ -49,15 +55,31 @@ class PatternPlan:
     inverses: bool | None = None
     rows: bool | None = None
     codes: bool = True
+    sine_period_px: int | None = None
+    sine_steps: int | None = None
 
     def __post_init__(self) -> None:
         # Requests and stored plans bring plain text.
         object.__setattr__(self, "sequence", SequenceName(self.sequence))
+        given = [name for name in unused_options(self.sequence) if getattr(self, name) != _DEFAULTS[name]]
+        if given:
+            words = (
+                f"sinusoids alone: leave it out, use {setting('sine_period_px')} and {setting('sine_steps')}, or ask "
+                f"for another {setting('sequence')}"
+                if SEQUENCES[self.sequence].sines
+                else f"lines and code: leave it out, or ask for {setting('sequence')} {SequenceName.PHASE}"
+            )
+            message = f"{' and '.join(given)}: the sequence {self.sequence} plays {words}"
+            raise ConfigError(message)
 
     @property
     def named(self) -> SequenceOptions:
         """The sequence with what this plan says otherwise."""
         usual = SEQUENCES[self.sequence]
+        if usual.sines:
+            return replace(
+                usual, period_px=self.sine_period_px or usual.period_px, steps=self.sine_steps or usual.steps
+            )
         period_px, width_px = self.line_shift_period_px or usual.period_px, self.line_width_px or usual.line_width_px
         proven = self.line_shift and (2 * width_px == period_px if width_px else period_px % 2 == 0)
         inverses = usual.inverses or not proven if self.inverses is None else self.inverses
@@ -72,6 +94,14 @@ class PatternPlan:
             inverses=inverses,
             closing=max(usual.closing, 2 if inverses else 0),
         )
+
+
+_DEFAULTS = {each.name: each.default for each in fields(PatternPlan)}
+
+
+def unused_options(sequence: SequenceName) -> tuple[str, ...]:
+    """Names of the options of `PatternPlan` that mean nothing in a sequence: those of lines, or those of sinusoids."""
+    return _OF_LINES if SEQUENCES[sequence].sines else _OF_SINES
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from slrig.bundle import MAX_CAPTURE_BYTES
 from slrig.devices import CameraInfo, ProjectorInfo
 from slrig.errors import UnsupportedByDeviceError, setting
-from slrig.model import Axis, Black, Calibration, Pattern, PatternSequence, Size, White
-from slrig.patterns import encode, scan_patterns
+from slrig.model import Axis, Black, Calibration, Pattern, PatternSequence, Sine, Size, White
+from slrig.patterns import encode, phase_patterns, scan_patterns
 from slrig.rig.session import RigFacts
 from slrig.scan.light_axis import played_axes
 from slrig.scan.plan import PatternPlan, ScanPlan
@@ -33,6 +33,15 @@ def pattern_sequence(
         return encode(recorded, size)
     axes = played_axes(plan.rows, calibration, cameras, axis=axis)
     named = plan.named
+    rows, columns = (plan.codes and axis in axes for axis in (Axis.ROW, Axis.COLUMN))
+    if named.sines:
+        return encode(
+            phase_patterns(
+                size, period_px=named.period_px, steps=named.steps, rows=rows, columns=columns,
+                coloured_light=coloured_light,
+            ),
+            size,
+        )  # fmt: skip
     patterns = scan_patterns(
         size,
         line_shift=plan.line_shift,
@@ -43,8 +52,8 @@ def pattern_sequence(
         line_width_px=named.line_width_px,
         gray_cell_px=plan.gray_cell_px,
         gray_offset_px=plan.gray_offset_px,
-        rows=plan.codes and Axis.ROW in axes,
-        columns=plan.codes and Axis.COLUMN in axes,
+        rows=rows,
+        columns=columns,
         coloured_light=coloured_light,
     )
     return encode(patterns, size)
@@ -95,7 +104,7 @@ def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None 
         The region names a camera that is not there, or a mask of another extent.
     UnsupportedByDeviceError
         A camera cannot expose that long, or that briefly, or has no colour, or the frames are more than a bundle holds.
-        Or there is no turntable to turn.
+        Or there is no turntable to turn, or the projector shows no shades of grey.
     """
     if plan.turn_deg is not None and plan.turned_by == "table" and not facts.turntable:
         raise no_turntable(plan.turn_deg)
@@ -108,6 +117,13 @@ def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None 
         plan.patterns, projector.size, calibration, facts.cameras, axis=axis, recorded=projector.recorded,
         coloured_light=plan.coloured_light,
     )  # fmt: skip
+    if not projector.shades and any(isinstance(each, Sine) for each in sequence.patterns):
+        message = (
+            f"{setting('sequence')}: {plan.patterns.sequence} plays sinusoids, and the projector '{projector.model}' "
+            "shows black and white alone. Ask for standard or fast, or connect its video input and drive it as a "
+            "display (driver screen or kms in the rig file), which shows shades of grey"
+        )
+        raise UnsupportedByDeviceError(message)
     count, coloured = len(sequence) * plan.exposure_count, in_colour(plan, facts.cameras, projector)
     ends = sum(isinstance(each, White | Black) for each in sequence.patterns) * plan.exposure_count
     key = "exposure_s" if plan.exposures_s is None else "exposures_s"

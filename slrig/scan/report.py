@@ -21,11 +21,13 @@ from slrig.model import (
     Calibration,
     CaptureHeader,
     FloatArray,
+    Gray,
     LineShift,
     Mesh,
     Pinhole,
     PointCurves,
     Refusal,
+    Sine,
     Size,
     SolveRecord,
     Source,
@@ -35,6 +37,7 @@ from slrig.model import (
 from slrig.reconstruction import CameraCurves, ExposureUse, MergedCurves, PairRedundancy, Redundancy
 from slrig.scan.artefacts import REPORT_FORMAT
 
+GRAY_ONLY = "Gray-only"
 _MOST_OFF = 0.1
 
 
@@ -217,7 +220,7 @@ def capture_report(capture: CaptureHeader, axis: Axis, evidence: EvidenceSummary
     return {
         "format": REPORT_FORMAT,
         "version": 1,
-        "method": "Gray code and line shift" if _has_lines(capture, axis) else "Gray-only",
+        "method": _method(capture, axis),
         "identity": str(evidence),
         "axis": axis.value,
         "frames": {
@@ -240,8 +243,13 @@ def capture_report(capture: CaptureHeader, axis: Axis, evidence: EvidenceSummary
     }
 
 
-def _has_lines(capture: CaptureHeader, axis: Axis) -> bool:
-    return any(isinstance(pattern, LineShift) and pattern.axis is axis for pattern in capture.displayed_patterns)
+def _method(capture: CaptureHeader, axis: Axis) -> str:
+    kinds = {type(pattern) for pattern in capture.displayed_patterns if getattr(pattern, "axis", None) is axis}
+    if LineShift in kinds:
+        return "Gray code and line shift"
+    if Sine in kinds:
+        return "Gray code and phase shift" if Gray in kinds else "phase shift"
+    return GRAY_ONLY
 
 
 def capture_notes(
@@ -256,7 +264,7 @@ def capture_notes(
     is_evened : light that changed between a bit and its inverse, or between line frames, was undone.
     """
     notes = []
-    if not _has_lines(capture, axis):
+    if _method(capture, axis) == GRAY_ONLY:
         notes.append(
             "Gray-only: no line-shift frames, so points lie on the edges of the Gray code, located to sub-pixel"
         )

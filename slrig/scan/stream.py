@@ -32,11 +32,20 @@ from slrig.model import (
     Refusal,
     Region,
     Shot,
+    Sine,
     Size,
     White,
     exposure_groups,
 )
-from slrig.patterns import cell_positions, edge_positions, index_of_word, line_positions
+from slrig.patterns import (
+    cell_positions,
+    edge_positions,
+    gray_bits,
+    index_of_word,
+    level_lines,
+    line_positions,
+    require_numbered,
+)
 from slrig.reconstruction import (
     NEAR_SATURATION,
     AxisFrames,
@@ -259,7 +268,7 @@ class _CameraFrames:
         self._cross_lines = _single_cross_lines(self._wanted, axis)
         self._cross_image: NDArray[Any] | None = None
         patterns = axis_patterns(self._wanted, name, axis)
-        if one_exposure and all(self._wanted[each] == 1 for each in used if isinstance(each, Gray | LineShift)):
+        if one_exposure and all(self._wanted[each] == 1 for each in used if isinstance(each, Gray | LineShift | Sine)):
             form = header.cameras[name]
             stacks = FrameStacks(
                 patterns,
@@ -267,7 +276,7 @@ class _CameraFrames:
                 full_scale=float(form.full_scale),
                 reference_repeats=reference_repeats(used, axis),
             )
-            tables = _tables(patterns.gray, patterns.lines, header.projector)
+            tables = _tables(patterns, header.projector)
             self._stream = CameraStream(stacks, tables, self._limits, report_step=self._entered, region=self._asked)
             if (second := self._second_patterns()) is not None:
                 self._second = FrameStacks(second, form.size.shape, full_scale=float(form.full_scale))
@@ -325,7 +334,7 @@ class _CameraFrames:
             frames, noise = axis_frames(capture, self._name, self._axis), None
             if second is not None:
                 self._second = FrameStacks.from_frames(axis_frames(capture, self._name, second.gray.axis))
-        tables = _tables(frames.gray, frames.line_patterns, self._header.projector)
+        tables = _tables(axis_patterns(self._wanted, self._name, self._axis), self._header.projector)
         curves = camera_curves(frames, tables, self._limits, report_step=self._entered, noise=noise, region=self._asked)
         return curves, frames, fused
 
@@ -347,7 +356,7 @@ class _CameraFrames:
         if curves.gamma != 1:
             stacks.linearise(curves.gamma)
         frames = stacks.frames()
-        tables = _tables(frames.gray, frames.line_patterns, self._header.projector)
+        tables = _tables(axis_patterns(self._wanted, self._name, frames.axis), self._header.projector)
         second = decode_second_axis(frames, curves.noise, tables, ReconstructionLimits().decoding)
         pairs = find_correspondences(curves.ensemble, second, self._axis)
         positions = second.positions
@@ -475,12 +484,12 @@ def step_px(shown: Collection[Pattern], axis: Axis) -> float:
     if lines:
         shifts = [p.shift for p in lines]
         return float(np.diff([*shifts, shifts[0] + lines[0].period_px]).max())
-    return cell_px(shown, axis)
+    return 1.0 if _has_sinusoids(shown, axis) else cell_px(shown, axis)
 
 
 def cell_px(shown: Collection[Pattern], axis: Axis) -> float:
-    """Width of a cell of the code."""
-    return float(next(p.cell_px for p in shown if isinstance(p, Gray) and p.axis is axis))
+    """Width of a cell of the code; of a position that sinusoids number themselves, 1."""
+    return float(next((p.cell_px for p in shown if isinstance(p, Gray) and p.axis is axis), 1))
 
 
 def _single_cross_lines(patterns: Collection[Pattern], axis: Axis) -> LineShift | None:
@@ -489,7 +498,23 @@ def _single_cross_lines(patterns: Collection[Pattern], axis: Axis) -> LineShift 
     return lines[0] if len(lines) == 1 and lines[0].is_half_lit else None
 
 
-def _tables(gray: Gray, lines: tuple[LineShift, ...], size: Size) -> CodeTables:
+def _has_sinusoids(shown: Collection[Pattern], axis: Axis) -> bool:
+    return any(isinstance(p, Sine) and p.axis is axis for p in shown)
+
+
+def _tables(patterns: AxisPatterns, size: Size) -> CodeTables:
+    """Tables of the positions of an axis. Raises PatternError: sinusoids do not tell their periods apart."""
+    gray, lines = patterns.gray, patterns.lines
+    if patterns.sines:
+        if not patterns.has_code:
+            require_numbered(patterns.sines, size)
+        positions = Gray(gray.axis, 0, gray_bits(size.along(gray.axis), 1, 0))
+        return CodeTables(
+            index_of_word=index_of_word(gray),
+            cell_position=cell_positions(positions, size),
+            position_table=line_positions(level_lines(patterns.sines), positions, size),
+            edge_table=edge_positions(gray, size) if patterns.has_code else np.zeros((0, 0)),
+        )
     return CodeTables(
         index_of_word=index_of_word(gray),
         cell_position=cell_positions(gray, size),

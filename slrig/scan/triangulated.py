@@ -30,6 +30,7 @@ from slrig.reconstruction import (
     CameraCurves,
     MergedCurves,
     SheetCurves,
+    SinusoidResponse,
     calibration_modes,
     calibration_sigma,
     evaluate_redundancy,
@@ -292,6 +293,7 @@ def _with_cause(camera: CameraResult, pixels_px: FloatArray, used: NDArray[np.bo
 
 
 _MIN_UNRESOLVED = 0.02  # of what is lit
+_NOTED_GAMMA, _NOTED_MISFIT = 0.1, 0.02
 _WIDEST_BRIDGES = 2.5
 """Of the gaps up to which a curve counts as measured: what strips still bridge at the usual limit of a depth edge."""
 
@@ -379,6 +381,32 @@ def camera_notes(cameras: Sequence[CameraResult]) -> list[str]:
                 "edges of the code show; they were made proportional to light again. Switch its gamma correction off "
                 "to keep the levels that it costs"
             )
+        if camera.curves.sinusoids is not None:
+            notes += _sinusoid_notes(camera.name, camera.curves.sinusoids)
+    return notes
+
+
+def _sinusoid_notes(camera: str, response: SinusoidResponse) -> list[str]:
+    """Sentences on light that does not follow the values of the sinusoids."""
+    notes = []
+    if np.isnan(response.gamma):
+        notes.append(
+            f"camera '{camera}': nothing in the frames shows whether light follows the values of the sinusoids (three "
+            "shifts of one period without white and black, or too little light): σ holds noise only, and a gamma of "
+            "the projector bends the surface. Add white and black, a fourth shift or another period; or be sure that "
+            "the projector is linear"
+        )
+    elif abs(response.gamma - 1) >= _NOTED_GAMMA:
+        notes.append(
+            f"camera '{camera}': light follows the values of the sinusoids to the power of {response.gamma:.2f}, by "
+            "gamma of projector or camera. Positions are corrected for it; without gamma they have less noise"
+        )
+    if response.misfit >= _NOTED_MISFIT:
+        notes.append(
+            f"camera '{camera}': frames of sinusoids are {response.misfit:.1%} of their modulation beside what all "
+            "frames together say, and σ contains this: light that changed between frames, surfaces that light each "
+            "other, or a projector whose light is no power of its values. Lock the exposure, keep object and rig still"
+        )
     return notes
 
 

@@ -76,6 +76,34 @@ def test_a_scan_of_a_recorded_scan_is_that_scan(tmp_path: Path) -> None:
     assert written(again) == meshes(bundle, tmp_path / "reconstructed")
 
 
+def keys(document: object) -> object:
+    """The keys of a report at every depth."""
+    return {key: keys(value) for key, value in document.items()} if isinstance(document, dict) else None
+
+
+@pytest.mark.slow
+def test_a_scan_by_sinusoids_gives_what_one_by_lines_gives_and_is_replayed(tmp_path: Path) -> None:
+    with serving(write_rig(tmp_path / "rig", faults=SECOND_CAMERA), tmp_path / "data") as service:
+        with service.client() as client:
+            lines = scanned(client)
+            sines = scanned(client, patterns={"sequence": "phase"})
+        folders = [service.data / "scans" / scan["id"] for scan in (lines, sines)]
+        by_lines, by_sines = (json.loads((folder / "report.json").read_text()) for folder in folders)
+    assert (lines["state"], sines["state"]) == ("succeeded", "succeeded"), sines["error"]
+    assert sines["links"]["files"].keys() == lines["links"]["files"].keys()
+    assert by_sines.keys() == by_lines.keys()
+    assert by_sines["evidence"].keys() == by_lines["evidence"].keys()
+    for name in by_lines.keys() - {"evidence", "health", "stages_s"}:
+        assert keys(by_sines[name]) == keys(by_lines[name]), name
+    assert by_sines["truth"]["complete_0.3mm"] > 0.98 * by_lines["truth"]["complete_0.3mm"]
+    rig = tmp_path / "replayed.toml"
+    rig.write_text(REPLAYED.format(bundle=folders[1] / "bundle", speed=0))
+    with serving(rig, tmp_path / "again") as service, service.client() as client:
+        again = scanned(client)
+        assert again["state"] == "succeeded", again
+        assert written(service.data / "scans" / again["id"]) == written(folders[1])
+
+
 @pytest.mark.shared
 @pytest.mark.slow
 def test_a_scan_of_another_programs_recording_gives_its_mesh(shared: Path, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slrig.model import Axis, Gray, LineShift, Size
+from slrig.model import Axis, Gray, LineShift, Sine, Size
 from slrig.model.patterns import gray_index, to_gray
 from slrig.patterns.codes import (
     cell_centre_px,
@@ -20,6 +20,8 @@ from slrig.patterns.codes import (
     line_position_px,
     line_profile,
 )
+from slrig.patterns.sequence import encode, phase_patterns
+from slrig.patterns.sine_positions import sine_periods_px, sine_position_px, sine_turns
 
 few = settings(max_examples=30)
 
@@ -131,3 +133,41 @@ def test_the_line_number_survives_a_code_edge_that_is_off_by_less_than_a_quarter
     cells = np.floor((seen_px + 0.5 + offset_px) / cell_px)
     centres = cell_centre_px(cells, cell_px=cell_px, offset_px=offset_px)
     assert (line_number(centres, pattern) == numbers).all()
+
+
+sines = st.tuples(st.integers(1, 3000), st.integers(4, 64))
+
+
+@few
+@given(sines, st.integers(3, 8), st.sampled_from(Axis))
+def test_played_sinusoids_number_every_position(drawn: tuple[int, int], steps: int, axis: Axis) -> None:
+    extent_px, period_px = drawn
+    size = Size(extent_px, 1) if axis is Axis.COLUMN else Size(1, extent_px)
+    patterns = phase_patterns(
+        size, period_px=period_px, steps=steps, rows=axis is Axis.ROW, columns=axis is Axis.COLUMN
+    )
+    light = np.array([profile.ravel() for profile in encode(patterns[2:], size).profiles], np.float64)
+    periods_px = [each.period_px for each in patterns if isinstance(each, Sine) and each.shift == 0]
+    found = sine_position_px([sine_turns(each) for each in light.reshape(3, steps, -1)], periods_px, extent_px)
+    # All that is lost is the rounding to 8 bits.
+    np.testing.assert_allclose(found.position_px, np.arange(extent_px), atol=0.003 * period_px)
+    assert found.residual_turns.max() < 0.003
+
+
+@few
+@given(sines, st.integers(0, 2**32 - 1))
+def test_phases_are_numbered_rightly_however_they_err_within_the_margin(drawn: tuple[int, int], seed: int) -> None:
+    extent_px, period_px = drawn
+    random = np.random.default_rng(seed)
+    periods_px = np.array(sine_periods_px(extent_px, period_px))
+    position_px = random.uniform(0, extent_px - 1, 2000)
+    error = random.normal(size=(3, 2000))
+    count = max(3, -(-extent_px // period_px) + 1)
+    error *= 0.33 / np.sqrt(count) / np.linalg.norm(error, axis=0)
+    found = sine_position_px(position_px / periods_px[:, None] + error, periods_px, extent_px)
+    assert np.abs(found.position_px - position_px).max() < period_px / 2
+
+
+def test_a_phase_that_is_unknown_has_no_position() -> None:
+    found = sine_position_px([[np.nan, 0.0], [0.0, 0.0], [0.0, 0.0]], sine_periods_px(640, 12), 640)
+    assert np.isnan(found.position_px).tolist() == np.isnan(found.residual_turns).tolist() == [True, False]

@@ -73,6 +73,11 @@ def test_calibration_is_opened_shot_solved_and_used(calibrating: TestClient, ser
     assert made["patterns"]["rows"] is True
     assert made["patterns"]["sequence"] == "robust"
     assert (made["patterns"]["line_width_px"], made["patterns"]["line_shift_period_px"]) == (2, 6)
+    # Poses are read by code, also on a rig that scans by sinusoids.
+    assert refusal(client, "POST", "/calibration", json={"patterns": {"sequence": "phase"}}) == (
+        422,
+        "/problems/config",
+    )
     assert refusal(client, "GET", f"{here}/coverage.png")[0] == 409
     quiet = client.get(made["links"]["events"])
     assert (quiet.status_code, quiet.content) == (204, b"")

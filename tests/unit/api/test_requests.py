@@ -22,7 +22,7 @@ from slrig.devices import CameraInfo, ProjectorInfo, Trigger
 from slrig.errors import ConfigError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Region, Size
 from slrig.rig.session import RigFacts
-from slrig.scan.plan import ReconstructionPlan, ScanPlan
+from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.plan_check import check_plan
 from slrig.scan.presets import SHIPPED, Presets
 from slrig.scan.records import plan_from_json, plan_json
@@ -152,6 +152,12 @@ def test_plan_is_the_request_over_the_rig_file_over_the_default(client: TestClie
     patterns = plan["patterns"]
     assert (patterns["line_width_px"], patterns["line_shift_period_px"], patterns["rows"]) == (2, 6, None)
     assert plan["reconstruction"].pop("region")["box_mm"] == BOX
+    sines = client.post("/scan", json={"patterns": {"sequence": "phase", "sine_period_px": 16}, "if_busy": "queue"})
+    patterns = sines.json()["plan"]["patterns"]
+    # The rig file's period is that of lines.
+    assert (patterns["sine_period_px"], patterns["sine_steps"], patterns["line_shift_period_px"]) == (16, None, None)
+    mixed = {"patterns": {"sequence": "phase", "line_width_px": 2}}
+    assert refusal(client, "POST", "/scan", json=mixed) == (422, "/problems/config")
     assert plan["reconstruction"] == {
         "keep_holes": True,
         "depth_edge_ratio": 6.0,
@@ -210,6 +216,10 @@ def test_plan_on_record_keeps_its_exposures_and_its_region() -> None:
     [
         (ScanPlan, {"exposures_s": (0.01, 0.0101)}, "exposures_s: expected times that differ by 10% at least"),
         (ScanPlan, {"exposures_s": (0.01, 0.04), "exposure_s": 0.01}, "expected exposure_s or exposures_s, found both"),
+        (PatternPlan, {"sequence": "phase", "line_width_px": 2}, "^line_width_px: the sequence phase plays sinusoids"),
+        (PatternPlan, {"sequence": "phase", "gray_cell_px": 2}, "^gray_cell_px: .* use sine_period_px"),
+        (PatternPlan, {"sequence": "phase", "line_shift": False, "inverses": True}, "^line_shift and inverses: "),
+        (PatternPlan, {"sine_steps": 4}, r"^sine_steps: the sequence standard plays lines .* \(--sequence\) phase"),
         (Region, {"box_mm": ((1, 0, 0), (0, 1, 1))}, "box_mm: x: expected two rising numbers, found 1 and 0"),
         (Region, {"box_mm": ((0, 0, float("nan")), (1, 1, 1))}, "box_mm: z: expected two rising numbers"),
         (Region, {"depth_mm": (300, 300)}, "depth_mm: expected two rising numbers"),

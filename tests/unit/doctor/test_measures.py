@@ -459,6 +459,16 @@ def test_lines_that_suit_the_blur_take_the_place_of_those_there(old: Path) -> No
     assert "bars are blurred by 3.5 projector pixels" in comment
 
 
+def test_sinusoids_that_suit_the_blur_leave_lines_as_they_are(old: Path) -> None:
+    old.write_text(old.read_text() + "line_width_px = 2\n")
+    advice = advise_lines(3.5, 8, 4, sines=True)
+    assert advice is not None
+    new = old.with_name("new.toml")
+    write_rig_file(diagnosis(lines=advice), old, new, force=False)
+    lines = {"line_shift_period_px": 12, "line_width_px": 2}
+    assert tomllib.loads(new.read_text())["scan"] == {**lines, "sine_period_px": 24, "sine_steps": 4}
+
+
 @pytest.mark.parametrize(
     ("blur_px", "period_px"),
     [(0.0, None), (0.6, None), (1.5, None), (2.2, 16), (3.0, 16), (5.0, 32), (math.inf, None), (math.nan, None)],

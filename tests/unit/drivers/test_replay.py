@@ -14,7 +14,20 @@ from slrig.bundle import read_bundle, write_bundle
 from slrig.capture.sequencer import capture
 from slrig.devices import CameraSettings, DisplayedPattern, Rig, ScannerHead, Trigger
 from slrig.errors import ConfigError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
-from slrig.model import Axis, Black, CameraFormat, Capture, Frame, Gray, LineShift, Pattern, Shot, Size, White
+from slrig.model import (
+    Axis,
+    Black,
+    CameraFormat,
+    Capture,
+    Frame,
+    Gray,
+    LineShift,
+    Pattern,
+    SequenceName,
+    Shot,
+    Size,
+    White,
+)
 from slrig.patterns.sequence import encode
 from slrig.scan.plan import PatternPlan
 from slrig.scan.plan_check import pattern_sequence
@@ -154,6 +167,17 @@ def test_what_was_recorded_is_played_unless_a_plan_asks_for_patterns_of_its_own(
     assert pattern_sequence(PatternPlan(), PROJECTOR, recorded=recorded).patterns == recorded
     asked = pattern_sequence(PatternPlan(line_shift=False), PROJECTOR, recorded=recorded)
     assert asked.patterns == pattern_sequence(PatternPlan(line_shift=False), PROJECTOR).patterns
+
+
+def test_sinusoids_are_found_again_by_their_periods(tmp_path: Path) -> None:
+    asked = pattern_sequence(PatternPlan(sequence=SequenceName.PHASE, sine_period_px=7), PROJECTOR)
+    recording = [shot(index, 10 * index) for index in range(len(asked))]
+    head = head_of(tmp_path, recording, asked.patterns)
+    assert values(head, asked.patterns) == [10 * index for index in range(14)]
+    assert head.projector.info.recorded == asked.patterns
+    others = pattern_sequence(PatternPlan(sequence=SequenceName.PHASE), PROJECTOR)
+    with pytest.raises(UnsupportedByDeviceError, match="black; column sinusoids in 4 steps, period 7 px"):
+        head.projector.load(others)
 
 
 def test_a_recording_that_lacks_a_fine_bit_is_one_of_fewer_bits(tmp_path: Path) -> None:

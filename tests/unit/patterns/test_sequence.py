@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from slrig.errors import PatternError
-from slrig.model import Axis, Black, Gray, LineShift, Pattern, Primary, Size, White
-from slrig.patterns.sequence import encode, merge_sequences, scan_patterns
+from slrig.model import Axis, Black, Gray, LineShift, Pattern, Primary, Sine, Size, White
+from slrig.patterns.sequence import encode, merge_sequences, phase_patterns, scan_patterns
 
 
 def patterns_of(
@@ -73,6 +73,21 @@ def test_coloured_white_is_between_code_frames(options: Any) -> None:
     rest = tuple(pattern for pattern in patterns if not isinstance(pattern, Primary))
     assert rest == patterns_of(Size(64, 48), **options)
     assert encode([Primary("red")], Size(64, 48)).profiles[0].tolist() == [[255]]
+
+
+def test_sinusoids_follow_white_and_black_period_by_period_in_all_their_shifts() -> None:
+    patterns = phase_patterns(Size(64, 48), period_px=9, steps=3, rows=True, coloured_light=True)
+    at = [index for index, pattern in enumerate(patterns) if isinstance(pattern, Primary)]
+    for index in at:
+        assert all(isinstance(patterns[index + step], Sine) for step in (-1, 1))
+    sines = [pattern for pattern in patterns if isinstance(pattern, Sine)]
+    assert patterns[:2] == (White(), Black())
+    assert len(patterns) == 2 + len(at) + len(sines) == 2 + 3 + 2 * 3 * 3
+    assert [each.axis for each in sines] == [Axis.COLUMN] * 9 + [Axis.ROW] * 9
+    assert [each.shift for each in sines] == [0, 1, 2] * 6
+    assert len({(each.axis, each.period_px) for each in sines}) == 6
+    with pytest.raises(PatternError, match="in 2 steps has no phase"):
+        phase_patterns(Size(64, 48), period_px=9, steps=2, rows=False)
 
 
 def test_a_cell_wider_than_half_a_period_is_refused() -> None:

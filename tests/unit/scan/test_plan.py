@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from slrig.errors import ConfigError, PatternError
+from slrig.errors import ConfigError, PatternError, UnsupportedByDeviceError
 from slrig.model import (
     MIN_BASELINE_FRACTION,
     Axis,
+    Black,
     Calibration,
     CameraFormat,
     FlipRule,
@@ -23,7 +24,9 @@ from slrig.model import (
     LineShift,
     Pinhole,
     SequenceName,
+    Sine,
     Size,
+    White,
     baseline_fraction,
     depth_sensitive_cameras,
     triangulated_axis,
@@ -160,6 +163,26 @@ def test_bits_come_with_inverses_where_lines_do_not_prove_them(plan: PatternPlan
 def test_a_period_of_its_own_has_the_fewest_frames_of_lines_that_divide_it(period_px: int | None, frames: int) -> None:
     plan = PatternPlan(sequence=SequenceName.FAST, line_shift_period_px=period_px)
     assert sum(isinstance(each, LineShift) for each in pattern_sequence(plan, Size(64, 48)).patterns) == frames
+
+
+def test_sinusoids_are_played_in_their_period_and_steps_on_the_axes_of_lines() -> None:
+    plan = PatternPlan(sequence=SequenceName.PHASE, sine_period_px=10, sine_steps=5, rows=True)
+    patterns = pattern_sequence(plan, Size(64, 48)).patterns
+    sines = [each for each in patterns if isinstance(each, Sine)]
+    assert patterns[:2] == (White(), Black())
+    assert len(sines) == len(patterns) - 2 == 2 * 3 * 5
+    assert {each.axis for each in sines[:15]} == {Axis.COLUMN}
+    assert {each.axis for each in sines[15:]} == {Axis.ROW}
+    assert (sines[0].period_px, sines[0].steps) == (10, 5)
+
+
+def test_a_projector_of_black_and_white_refuses_sinusoids_before_anything_moves() -> None:
+    facts = RigFacts({"cam0": TameCamera().info}, replace(TameProjector().info, shades=False), None)
+    plan = ScanPlan(PatternPlan(sequence=SequenceName.PHASE))
+    with pytest.raises(UnsupportedByDeviceError, match=r"black and white alone.* standard or fast.* kms"):
+        check_plan(plan, facts)
+    assert check_plan(ScanPlan(), facts)
+    assert check_plan(plan, replace(facts, projector=TameProjector().info))
 
 
 @pytest.mark.parametrize(("bit_depth", "colour", "sample_bytes"), [(8, False, 1), (12, False, 2), (8, True, 1)])

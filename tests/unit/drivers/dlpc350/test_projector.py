@@ -364,7 +364,7 @@ def test_a_picture_of_another_kind_or_that_is_cut_and_shades_of_grey_are_refused
         with pytest.raises(ConfigError, match="expected a BMP file of 912 x 1140 pixels with 24 bits"):
             decode_planes(content, "splash.bmp")
     grey = PatternSequence(MIRRORS, (White(),), (np.full((1, 1), 128, np.uint8),))
-    with pytest.raises(UnsupportedByDeviceError, match="a mirror is on or off"):
+    with pytest.raises(UnsupportedByDeviceError, match="plays patterns of 1 bit: use lines"):
         pattern_plane(grey, 0)
 
 
