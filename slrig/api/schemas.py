@@ -87,6 +87,11 @@ class PatternRequest(Strict):
         description="true: columns and rows. false: columns alone. Default: what the calibration asks for, columns for "
         "devices side by side and rows for devices above one another; columns without a calibration",
     )
+    cross_lines: bool | None = Field(
+        default=None,
+        description="true: where one axis is played, also one frame of lines along the other, which tests the "
+        "calibration. Default false",
+    )
 
 
 class ReconstructionRequest(Strict):

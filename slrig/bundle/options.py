@@ -409,6 +409,7 @@ class ScanDefaults(Strict):
     gray_cell_px: Annotated[int, Field(ge=1)] | None = None
     gray_offset_px: Annotated[int, Field(ge=0)] | None = None
     rows: bool | None = None
+    cross_lines: bool | None = None
     keep_holes: bool | None = None
     depth_edge_ratio: Annotated[float, Field(gt=1)] | None = None
     max_code_gap: Annotated[int, Field(ge=1)] | None = None

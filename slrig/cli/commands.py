@@ -132,6 +132,10 @@ def scan(
     rows: Annotated[
         bool, typer.Option("--rows", help="Play columns and rows. Default: the axis the calibration asks for.")
     ] = False,
+    cross_lines: Annotated[
+        bool,
+        typer.Option("--cross-lines", help="Play one frame of lines along the other axis: it tests the calibration."),
+    ] = False,
     asked: ScanOptions,
     mesh: MeshOptions,
     queue: Annotated[bool, typer.Option("--queue", help="Wait in line if the rig is held.")] = False,
@@ -153,6 +157,7 @@ def scan(
         patterns=given(
             sequence=sequence, line_width_px=line_width_px, gray_cell_px=gray_cell_px, sine_steps=steps,
             **period_option(sequence, period_px), line_shift=False if gray_only else None, rows=rows or None,
+            cross_lines=cross_lines or None,
         ),
         reconstruction=mesh.asked(),
     )  # fmt: skip

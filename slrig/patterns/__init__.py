@@ -17,6 +17,7 @@ from slrig.patterns.sequence import (
     merge_sequences,
     phase_patterns,
     scan_patterns,
+    with_cross_lines,
 )
 from slrig.patterns.sine_positions import SinePosition, sine_periods_px, sine_position_px, sine_turns
 from slrig.patterns.sinusoids import level_lines, require_numbered
@@ -42,4 +43,5 @@ __all__ = [
     "sine_periods_px",
     "sine_position_px",
     "sine_turns",
+    "with_cross_lines",
 ]

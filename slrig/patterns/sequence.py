@@ -30,6 +30,8 @@ from slrig.model import (
 from slrig.patterns.codes import gray_bits, gray_profile, line_profile, sine_profile
 from slrig.patterns.sine_positions import sine_periods_px
 
+CROSS_LINE_WIDTH_PX = 16
+"""Chosen: a calibration that predicts the nearest edge to half of it numbers the edges."""
 GRAY_ONLY_CELL_PX = 2
 """Chosen: without lines edges are all that is measured, and those of cells of 1 px blur into each other."""
 
@@ -166,6 +168,15 @@ def phase_patterns(
     if coloured_light:
         _insert_lights(body)
     return (White(), Black(), *body)
+
+
+def with_cross_lines(patterns: Sequence[Pattern], axis: Axis) -> tuple[Pattern, ...]:
+    """Insert one frame of lines along an axis that is not played otherwise, which tests the calibration.
+
+    It follows the first two frames, white and black.
+    """
+    lines = LineShift(axis, 0, 2 * CROSS_LINE_WIDTH_PX, CROSS_LINE_WIDTH_PX)
+    return (*patterns[:2], lines, *patterns[2:])
 
 
 def _insert_lights(body: list[Pattern]) -> None:

@@ -41,7 +41,8 @@ class PatternPlan:
     sine_period_px : of the shortest sinusoid of the sequence `phase`; sine_steps : shifts of each.
     inverses : each bit is followed by its inverse; None stands for True unless lines of half their period prove bits.
     rows : True plays columns and rows, False columns alone, and None what the calibration asks for: columns for
-    devices side by side, rows for devices above one another; see `slrig.scan.light_axis.played_axes`. codes : False
+    devices side by side, rows for devices above one another; see `slrig.scan.light_axis.played_axes`. cross_lines :
+    where one axis is played, one frame of lines along the other, which tests the calibration. codes : False
     plays white and black alone: enough for poses that calibrate cameras without the projector, and for no scan.
     """
 
@@ -54,6 +55,7 @@ class PatternPlan:
     gray_offset_px: int = 0
     inverses: bool | None = None
     rows: bool | None = None
+    cross_lines: bool = False
     codes: bool = True
     sine_period_px: int | None = None
     sine_steps: int | None = None

@@ -8,7 +8,7 @@ from slrig.bundle import MAX_CAPTURE_BYTES
 from slrig.devices import CameraInfo, ProjectorInfo
 from slrig.errors import UnsupportedByDeviceError, setting
 from slrig.model import Axis, Black, Calibration, Pattern, PatternSequence, Sine, Size, White
-from slrig.patterns import encode, phase_patterns, scan_patterns
+from slrig.patterns import encode, phase_patterns, scan_patterns, with_cross_lines
 from slrig.rig.session import RigFacts
 from slrig.scan.light_axis import played_axes
 from slrig.scan.plan import PatternPlan, ScanPlan
@@ -35,27 +35,27 @@ def pattern_sequence(
     named = plan.named
     rows, columns = (plan.codes and axis in axes for axis in (Axis.ROW, Axis.COLUMN))
     if named.sines:
-        return encode(
-            phase_patterns(
-                size, period_px=named.period_px, steps=named.steps, rows=rows, columns=columns,
-                coloured_light=coloured_light,
-            ),
-            size,
+        patterns = phase_patterns(
+            size, period_px=named.period_px, steps=named.steps, rows=rows, columns=columns,
+            coloured_light=coloured_light,
         )  # fmt: skip
-    patterns = scan_patterns(
-        size,
-        line_shift=plan.line_shift,
-        period_px=named.period_px,
-        steps=named.steps,
-        inverses=named.inverses,
-        closing=named.closing,
-        line_width_px=named.line_width_px,
-        gray_cell_px=plan.gray_cell_px,
-        gray_offset_px=plan.gray_offset_px,
-        rows=rows,
-        columns=columns,
-        coloured_light=coloured_light,
-    )
+    else:
+        patterns = scan_patterns(
+            size,
+            line_shift=plan.line_shift,
+            period_px=named.period_px,
+            steps=named.steps,
+            inverses=named.inverses,
+            closing=named.closing,
+            line_width_px=named.line_width_px,
+            gray_cell_px=plan.gray_cell_px,
+            gray_offset_px=plan.gray_offset_px,
+            rows=rows,
+            columns=columns,
+            coloured_light=coloured_light,
+        )
+    if plan.cross_lines and rows != columns:
+        patterns = with_cross_lines(patterns, Axis.COLUMN if rows else Axis.ROW)
     return encode(patterns, size)
 
 

@@ -313,3 +313,17 @@ def test_of_several_cameras_the_longest_baseline_of_the_first_decides() -> None:
     assert baseline_fraction(Axis.ROW, cameras, None) == 1.0
     # Without a baseline columns are as good as rows.
     assert triangulated_axis(cameras[:1], None) is triangulated_axis(cameras[:1] * 2, None) is Axis.COLUMN
+
+
+@pytest.mark.parametrize("sequence", [SequenceName.STANDARD, SequenceName.PHASE])
+def test_cross_lines_are_one_frame_of_the_axis_that_is_not_played(sequence: SequenceName) -> None:
+    def patterns(*, rows: bool, cross_lines: bool) -> tuple[object, ...]:
+        return pattern_sequence(PatternPlan(sequence, rows=rows, cross_lines=cross_lines), Size(640, 400)).patterns
+
+    without, crossed = (patterns(rows=False, cross_lines=each) for each in (False, True))
+    (added,) = set(crossed) - set(without)
+    assert isinstance(added, LineShift)
+    assert added.axis is Axis.ROW
+    assert added.is_half_lit
+    assert len(crossed) == len(without) + 1
+    assert patterns(rows=True, cross_lines=True) == patterns(rows=True, cross_lines=False)
