@@ -36,12 +36,13 @@ _FIT_STEPS = 2
 _GAINS = (0.05, 1.5)  # of the contrast of a period
 _BLOCK = 512  # pixels
 _MAX_MISFIT, _MAX_MISFIT_SIGMAS = 0.04, 1.2  # of the swing; of the noise
+_MAX_FRAME_MISFIT = 1.5  # times the limit, of one frame
 _MAX_WRONG = 3  # frames; more are no fault of single ones
 _MIN_TRIED = 3  # sets of frames that are enlarged
 _LEFT_FRACTION, _MAX_LEFT_FRACTION = 0.15, 0.3  # of the mean square, without the frames that are wrong
 _MAX_FIRST_FRACTION = 0.75  # the same, without one of several that are wrong
 _MIN_JUMPS = 0.02  # of the adjacent pixels
-_LIGHT_STEPS = 5
+_LIGHT_STEPS, _MIN_FITTED_CHANGE = 5, 0.06
 _BRIGHT = 0.5  # of the most light of a frame, where its factor is measured
 _MIN_LIT_DEVIATION = 0.12  # of the light of a frame, to tell a factor from a shift
 _DOUBTFUL_MISFIT = 2.0  # times the limit, to suspect frames of which none is proven wrong
@@ -112,10 +113,16 @@ def check_agreement(frames: Light, model: LightModel, band: Integers) -> FrameAg
     limit = _MAX_MISFIT + _MAX_MISFIT_SIGMAS * fit.noise
     misfits = np.array([fit.misfit(band == each) if np.any(band == each) else 0.0 for each in range(BANDS)])
     where = np.isin(band, np.flatnonzero(misfits > limit**2))
-    if where.any():
+    if np.sqrt(np.mean(fit.rest**2, axis=1)).max() > _MAX_FRAME_MISFIT * limit and not where.any():
+        where = everywhere
+    is_changed = np.abs(_factors(frames, model, fit, is_exposure=False) - 1) > _MIN_FITTED_CHANGE
+    if where.any() or is_changed.any():
         lights = _find_lights(frames, model, fit, band)
         if lights:
-            return FrameAgreement(model.provable() & (fit.shape.std(axis=1) > _MIN_DEVIATION), everywhere, lights=lights)
+            return FrameAgreement(
+                model.provable() & (fit.shape.std(axis=1) > _MIN_DEVIATION), everywhere, lights=lights
+            )
+    if where.any():
         found = _find_wrong(frames[:, where], model, fit.misfit(where), limit)
         if found is not None:
             wrong, suspects, shows = found
@@ -135,29 +142,35 @@ def _find_lights(frames: Light, model: LightModel, fit: FrameFit, band: Integers
 
     A frame whose light hardly varies over the pixels would fit with a factor where it shows another shift.
     """
-    before = fit.misfit(np.ones(frames.shape[1], dtype=np.bool_))
+    best, found = _MAX_LEFT_FRACTION * fit.misfit(np.ones(frames.shape[1], dtype=np.bool_)), tuple[FrameLight, ...]()
+    is_sine = np.array([isinstance(pattern, Sine) for pattern in model.patterns])
     for is_exposure in (False, True):
-        factors, again, evened = np.ones(len(frames), np.float32), fit, frames
+        again = fit
         for _ in range(_LIGHT_STEPS):
+            factors = _factors(frames, model, again, is_exposure=is_exposure)
             base = np.float32(0) if is_exposure else again.level
-            predicted = again.level + again.swing * again.shape - base
-            bright = again.shape >= _BRIGHT * again.shape.max(axis=1, keepdims=True)
-            ratio = np.where(bright, (frames - base) / np.maximum(predicted, 1e-3), np.nan)
-            steady = [isinstance(each, Black) for each in model.patterns]
-            factors = np.where(steady, np.float32(1), np.nanmedian(ratio, axis=1)).astype(np.float32)
-            whites = [factors[i] for i, each in enumerate(model.patterns) if isinstance(each, White)]
-            factors[~np.array(steady)] /= whites[0] if whites else np.median(factors)
             if not np.all((factors > 1 / MAX_LIGHT_FACTOR) & (factors < MAX_LIGHT_FACTOR)):
                 break
-            evened = base + (frames - base) / factors[:, np.newaxis]
-            again = fit_frames(evened, model)
+            again = fit_frames(base + (frames - base) / factors[:, np.newaxis], model)
         limit = _MAX_MISFIT + _MAX_MISFIT_SIGMAS * again.noise
         after = max(again.misfit(band == each) for each in np.unique(band))
-        doubtful = (np.abs(factors - 1) > STEADY_LIGHT) & (again.shape.std(axis=1) < _MIN_LIT_DEVIATION)
-        doubtful &= [isinstance(each, Sine) for each in model.patterns]
-        if after < limit**2 and after < _MAX_LEFT_FRACTION * before and not doubtful.any():
-            return tuple(FrameLight(float(each), is_exposure) for each in factors)
-    return ()
+        doubtful = is_sine & (np.abs(factors - 1) > STEADY_LIGHT) & (again.shape.std(axis=1) < _MIN_LIT_DEVIATION)
+        if after < min(limit**2, best) and not doubtful.any():
+            best, found = after, tuple(FrameLight(float(each), is_exposure) for each in factors)
+    return found
+
+
+def _factors(frames: Light, model: LightModel, fit: FrameFit, *, is_exposure: bool) -> Samples:
+    """(K,) float32: light of each frame relative to white, or to the median without white, where it is bright."""
+    base = np.float32(0) if is_exposure else fit.level
+    predicted = np.maximum(fit.level + fit.swing * fit.shape - base, 1e-3)
+    bright = fit.shape >= _BRIGHT * fit.shape.max(axis=1, keepdims=True)
+    ratio = np.where(bright, (frames - base) / predicted, np.nan)
+    factors = np.nanmedian(ratio, axis=1)
+    white = [place for place, pattern in enumerate(model.patterns) if isinstance(pattern, White)]
+    factors /= factors[white[0]] if white else np.median(factors)
+    factors[[isinstance(pattern, Black) for pattern in model.patterns]] = 1
+    return factors.astype(np.float32)
 
 
 def _find_wrong(

@@ -48,6 +48,9 @@ class AxisAgreement:
     lights: Mapping[int, FrameLight]
 
 
+_NOTHING = AxisAgreement((), (), frozenset(), {})
+
+
 def is_due(patterns: Sequence[Pattern], latest: Gray | Sine, known: Collection[int]) -> bool:
     """True if the frame of `latest` completes the sinusoids of a period, or all frames of its axis."""
     if isinstance(latest, Sine):
@@ -76,8 +79,8 @@ def check_axis(
     row: NDArray[np.intp],
     full_scale: int,
     projector: Size | None,
-) -> AxisAgreement | None:
-    """Compare the frames of an axis with one another; None if they are too few, or too few pixels are lit.
+) -> AxisAgreement:
+    """Compare the frames of an axis with one another; nothing follows if they are too few, or too few pixels are lit.
 
     patterns : of the sequence. frames : samples by pattern; the second half of the samples are neighbours of the first.
     row : image row of each sample. projector : its size, if it is known.
@@ -85,11 +88,11 @@ def check_axis(
     members = tuple(place for place in fitted_patterns(patterns, axis) if place in frames)
     shown = tuple(patterns[place] for place in members)
     if len(members) < 3 + MIN_SPARE_FRAMES or not any(isinstance(each, Sine) for each in shown):
-        return None
+        return _NOTHING
     stack = np.stack([frames[place] for place in members])
     chosen = choose_pixels(stack, shown, full_scale=full_scale)
     if chosen is None:
-        return None
+        return _NOTHING
     rows = np.tile(row[chosen[: len(chosen) // 2]], 2)
     found = check_agreement(
         stack[:, chosen], LightModel.of(shown, projector and projector.along(axis)), assign_bands(rows)

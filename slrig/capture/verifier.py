@@ -705,8 +705,6 @@ class FrameVerifier:
             self._patterns, pattern.axis, frames, row=sampler.row, full_scale=self._format.full_scale,
             projector=self._projector,
         )  # fmt: skip
-        if agreement is None:
-            return []
         findings.verified |= agreement.verified
         findings.lights.update(agreement.lights)
         findings.fitted_lights.update(agreement.lights)
