@@ -67,9 +67,9 @@ class CameraFindings:
         return [each for each in reported if each in others or (each in final and each not in vague)]
 
     def explains(self, reported: Sequence[Contradiction]) -> bool:
-        """True if frames of sinusoids, all of them together, prove which frames every contradiction is about."""
+        """True if there is no contradiction, or one in which all frames of an axis prove which are wrong."""
         final = [each for found in self.agreements.values() for each in found]
-        return all(each.wrong and each in final for each in reported)
+        return len(reported) <= 1 and all(each.wrong and each in final for each in reported)
 
     @property
     def noise_dn(self) -> float | None:

@@ -28,11 +28,12 @@ _STEPS_PER_PERIOD = 24  # of the position, in the shortest period
 _MAX_EXTENT_PX = 4096.0
 _SAME_PHASE = 0.02  # periods
 _MIN_PIXELS, _MAX_PAIRS = 200, 800
-_GAMMA_PIXELS, _SEARCH_PAIRS = 80, 150
+_GAMMA_PIXELS, _SEARCH_PAIRS, _ORDER_PAIRS = 80, 150, 60
 _MIN_LIT_FRACTION = 0.15  # of the 99th percentile of the range
 _GAMMAS = (1.0, 0.5, 0.7, 1.3, 1.6, 1.9, 2.2, 2.5)
 _EDGE_PX = 3.0
 _FIT_STEPS = 2
+_LIKE_PERIODS = 2.0  # ratio of two that blur dims alike
 _GAINS = (0.05, 1.5)  # of the contrast of a period
 _BLOCK = 512  # pixels
 _MAX_MISFIT, _MAX_MISFIT_SIGMAS = 0.04, 1.2  # of the swing; of the noise
@@ -177,9 +178,7 @@ def _find_wrong(
     frames: Light, model: LightModel, before: float, limit: float
 ) -> tuple[tuple[int, ...], tuple[int, ...], dict[int, int]] | None:
     """Return the frames without which the others fit, and what they show; or those of which some must be wrong."""
-    half = frames.shape[1] // 2
-    some = np.arange(half)[:: -(-half // _SEARCH_PAIRS)]
-    frames = frames[:, np.concatenate([some, some + half])]
+    frames = _some_pairs(frames, _SEARCH_PAIRS)
     count, everywhere = len(frames), np.ones(frames.shape[1], dtype=np.bool_)
     tried: list[tuple[float, tuple[int, ...], FrameFit]] = []
     for _ in range(min(_MAX_WRONG, count - 2 - MIN_SPARE_FRAMES)):
@@ -248,11 +247,16 @@ def _are_opposite(one: Samples, other: Samples) -> bool:
 
 def order_misfit(frames: Light, model: LightModel) -> tuple[float, float]:
     """Return the mean square of what does not fit, and its limit for frames in the right order."""
-    half = frames.shape[1] // 2
-    some = np.arange(half)[:: -(-half // _SEARCH_PAIRS)]
-    fit = fit_frames(frames[:, np.concatenate([some, some + half])], model)
+    fit = fit_frames(_some_pairs(frames, _ORDER_PAIRS), model)
     limit = _MAX_MISFIT + _MAX_MISFIT_SIGMAS * fit.noise
     return fit.misfit(np.ones(fit.rest.shape[1], dtype=np.bool_)), limit**2
+
+
+def _some_pairs(frames: Light, count: int) -> Light:
+    """Return at most `count` pairs of adjacent pixels."""
+    half = frames.shape[1] // 2
+    some = np.arange(half)[:: -(-half // count)]
+    return frames[:, np.concatenate([some, some + half])]
 
 
 def _is_off(fit: FrameFit, place: int) -> bool:
@@ -307,13 +311,15 @@ def choose_pixels(frames: Light, patterns: Sequence[Pattern], *, full_scale: int
 class LightModel:
     """Light of K patterns of one axis at the positions among which their frames decide.
 
-    by_gamma : (K, positions) float32, by gamma. groups : places of the sinusoids of each period. reach : by place of a
-    bit, over how many positions an edge of it may be blurred.
+    by_gamma : (K, positions) float32, by gamma. groups : places of the sinusoids of each period; equally_blurred :
+    those that have one contrast, as blur leaves it. reach : by place of a bit, over how many positions an edge of it
+    may be blurred.
     """
 
     patterns: tuple[Pattern, ...]
     by_gamma: Mapping[float, Light]
     groups: tuple[tuple[int, ...], ...]
+    equally_blurred: tuple[tuple[int, ...], ...]
     reach: Mapping[int, int]
 
     def provable(self) -> SampleMask:
@@ -346,8 +352,25 @@ class LightModel:
             tuple(patterns),
             {each: light.astype(np.float32) for each, light in lights.items()},
             tuple(map(tuple, groups)),
+            _equally_blurred(list(periods), groups),
             reach,
         )
+
+
+def _equally_blurred(periods: Sequence[float], groups: Sequence[Sequence[int]]) -> tuple[tuple[int, ...], ...]:
+    """Join each period of few frames, whose contrast and light are not told apart, with the nearest one of more."""
+    shared = {period: list(group) for period, group in zip(periods, groups, strict=True) if len(group) >= MIN_SHIFTS}
+    alone: list[tuple[int, ...]] = []
+    for period, group in zip(periods, groups, strict=True):
+        if len(group) >= MIN_SHIFTS:
+            continue
+        distances = {each: abs(float(np.log(each / period))) for each in shared}
+        nearest = min(distances, key=distances.__getitem__, default=None)
+        if nearest is not None and 1 / _LIKE_PERIODS <= nearest / period <= _LIKE_PERIODS:
+            shared[nearest] += group
+        else:
+            alone.append(tuple(group))
+    return (*map(tuple, shared.values()), *alone)
 
 
 def _positions_px(patterns: Sequence[Pattern], extent_px: int | None) -> FloatArray:
@@ -398,11 +421,13 @@ def fit_frames(frames: Light, model: LightModel, *, without: Collection[int] = (
     without : frames, by place, that take no part, and are predicted by the others.
     """
     used = np.array([place not in without for place in range(len(model.patterns))])
-    few = frames[:, :: -(-frames.shape[1] // _GAMMA_PIXELS)]
-    lights = {each: _with_contrast(few, light, used, model.groups, 1) for each, light in model.by_gamma.items()}
+    few = frames[:, :: max(frames.shape[1] // _GAMMA_PIXELS, 4)]
+    lights = {
+        each: _with_contrast(few, light, used, model.equally_blurred, 1) for each, light in model.by_gamma.items()
+    }
     misfits = {each: _median_misfit(few, light, used) for each, light in lights.items()}
     gamma = min(misfits, key=misfits.__getitem__)
-    light = _with_contrast(frames, lights[gamma], used, model.groups, _FIT_STEPS)
+    light = _with_contrast(frames, lights[gamma], used, model.equally_blurred, _FIT_STEPS)
     index, level, swing = _fit_once(frames, light, used)
     low, high = light[:, index], light[:, index]
     for place, reach in model.reach.items():

@@ -1,10 +1,9 @@
 """Frames that are stale, exchanged, torn or damaged, in scans of scenes whose light is worse in one way each: how many
 pass.
 
-`python -m tests.bench.fault_campaign --sequence fast --faults 2000` prints a row for each kind of fault; `--sequence
-2x3` and the other names of `sinusoids` play frames of sinusoids. A fault counts as passed if nothing contradicts it and the
-frame is nearer to another pattern or damaged by the measure of the drivers' contract; frames of sound scans that
-something contradicts are false alarms.
+`python -m tests.bench.fault_campaign --sequence fast --faults 2000` prints a row for each kind of fault; the names of
+`sinusoids` play those. A fault counts as passed if nothing contradicts it and the frame is nearer to another pattern or
+damaged by the measure of the drivers' contract; frames of sound scans that something contradicts are false alarms.
 """
 
 from __future__ import annotations

@@ -8,9 +8,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
+from slrig.bundle import RefusedFrame
+from slrig.capture import capture
 from slrig.capture.verifier import Evidence, EvidenceSummary, check_capture
 from slrig.model import Axis, Black, Capture, Gray, Pattern, Pixels, Shot, Sine, Size, White
-from tests.unit.capture.fake_rig import Scene
+from slrig.patterns import encode
+from tests.unit.capture.fake_rig import CameraFaults, Scene, fake_rig
 
 PROJECTOR, CAMERA = Size(256, 192), Size(320, 240)
 REFERENCES: tuple[Pattern, ...] = (White(), Black())
@@ -157,6 +160,33 @@ def test_a_wrong_frame_is_found_as_soon_as_its_period_is_complete() -> None:
     assert [evidence.add_shot(shot) for shot in (shots[4], *shots[6:])] == [()] * 9
     assert evidence.summary().faults == ()
     assert evidence.summary().verified == len(patterns)
+
+
+def test_stale_and_garbled_frames_are_shot_again() -> None:
+    patterns = (*REFERENCES, *shifted(128, 4), *shifted(16, 4))
+    fake = fake_rig(faults={"left": CameraFaults(garbled=frozenset({4}), stale=frozenset({8}))}, cameras=["left"])
+    sequence = encode(patterns, fake.projector.size)
+    evidence = Evidence(patterns, {"left": fake.cameras["left"].info.format}, projector=fake.projector.size)
+    refused: list[RefusedFrame] = []
+    kept = {shot.pattern: shot for shot in capture(fake.rig, sequence, evidence=evidence, refused=refused.append)}
+    assert kept.keys() == set(range(len(patterns)))
+    assert {each.pattern for each in refused} >= {4, 7}
+    assert evidence.summary().faults == ()
+    assert evidence.summary().verified == len(patterns)
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.25])
+@pytest.mark.parametrize("sequence", ["three periods of four", "2x3", "micro"])
+def test_a_change_of_light_is_measured_and_no_fault(sequence: str, factor: float) -> None:
+    patterns, stage = SEQUENCES[sequence], scene("strong ambient light")
+    frames = images(patterns, stage)
+    changed = len(patterns) - 2
+    frames[changed] = np.clip(np.rint(factor * frames[changed].astype(float)), 0, 255).astype(np.uint8)
+    found = summary(patterns, frames, stage)
+    assert found.faults == ()
+    assert found.frame_light["left"][changed].factor == pytest.approx(factor, abs=0.05)
+    light = found.light["left"]["column sinusoids"]
+    assert (light.least, light.most) == pytest.approx((min(factor, 1), max(factor, 1)), abs=0.05)
 
 
 def test_sinusoids_of_one_period_are_not_verified() -> None:
