@@ -227,17 +227,17 @@ def build_reference(
     if np.count_nonzero(clear) >= BAND_SAMPLES * BANDS:
         usable = clear
     tested = usable & (contrast >= np.median(contrast[usable]))
-    return ReferenceFrames(white, black, np.maximum(contrast, np.float32(1)), lit, tested, row, _assign_bands(row))
+    return ReferenceFrames(white, black, np.maximum(contrast, np.float32(1)), lit, tested, row, assign_bands(row))
 
 
-def _assign_bands(row: NDArray[np.intp]) -> NDArray[np.intp]:
+def assign_bands(row: NDArray[np.intp]) -> NDArray[np.intp]:
     """Assign rows to bands of equal numbers of samples."""
     return np.searchsorted(np.quantile(row, np.arange(1, BANDS) / BANDS), row, side="right")
 
 
 def _find_darker_band(contrast: Samples, high: float, row: NDArray[np.intp]) -> str | None:
     """Describe the band in which white − black is far below zero, which light cannot cause; None if there is none."""
-    band = _assign_bands(row)
+    band = assign_bands(row)
     # Noise of the median band, because damage does not affect all bands.
     lower = [float(np.percentile(contrast[band == b], 2.0)) for b in range(BANDS) if (band == b).any()]
     noise = max(0.0, -float(np.median(lower)) / 2.05)
@@ -384,7 +384,7 @@ def reference_change_fault(
     if noise is None:
         noise = max(NOISE_FLOOR_DN, 1.4826 * float(np.median(change)) / 2**0.5)
     wrong = change > np.maximum(0.3 * contrast[lit], 8 * noise)
-    where = _describe_worst(wrong, _assign_bands(row[lit]), row[lit], max_total=0.05, max_in_band=0.15)
+    where = _describe_worst(wrong, assign_bands(row[lit]), row[lit], max_total=0.05, max_in_band=0.15)
     if where is None:
         return None
     return (
@@ -414,7 +414,7 @@ def describe_worst_lit(
     wrong: SampleMask, row: NDArray[np.intp], *, max_total: float, max_in_band: float = 0.25
 ) -> str | None:
     """Describe wrong lit pixels in these rows, as `describe_worst_tested`."""
-    return _describe_worst(wrong, _assign_bands(row), row, max_total=max_total, max_in_band=max_in_band)
+    return _describe_worst(wrong, assign_bands(row), row, max_total=max_total, max_in_band=max_in_band)
 
 
 def _describe_worst(
@@ -435,7 +435,7 @@ def _describe_worst(
     fractions[counts < BAND_SAMPLES // 4] = 0.0
     top = int(np.argmax(fractions))
     inside = row[band == top]
-    return f"{fractions[top]:.0%} of the {unit} in {_describe_rows(inside)}" if fractions[top] > max_in_band else None
+    return f"{fractions[top]:.0%} of the {unit} in {describe_rows(inside)}" if fractions[top] > max_in_band else None
 
 
 def describe_contrast(ref: ReferenceFrames) -> str:
@@ -448,10 +448,11 @@ def describe_contrast(ref: ReferenceFrames) -> str:
 
 def describe_band(ref: ReferenceFrames, band: int) -> str:
     """Describe the rows of a band."""
-    return _describe_rows(ref.row[ref.band == band])
+    return describe_rows(ref.row[ref.band == band])
 
 
-def _describe_rows(row: NDArray[np.intp]) -> str:
+def describe_rows(row: NDArray[np.intp]) -> str:
+    """Describe the range of some rows."""
     return f"rows {row.min()} to {row.max()}"
 
 

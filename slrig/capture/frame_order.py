@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.capture.frame_checks import Samples
-from slrig.model import Axis, Black, FloatArray, Gray, Integers, LineShift, Pattern, White, from_gray
+from slrig.capture.sine_checks import LightModel, fitted_patterns, order_misfit
+from slrig.model import Axis, Black, FloatArray, Gray, Integers, LineShift, Pattern, Sine, Size, White, from_gray
 
 _MIN_FRAMES = 6
 _ENVELOPE_FRACTION = 0.12  # of the frames, above and below the range of a pixel, so that few frames may be damaged
@@ -31,6 +32,7 @@ _MAX_NAMED = 12
 _MAX_CHANGES = 3  # of a code; more are no exchange of single frames
 _MIN_CLOSER, _MAX_FURTHER_FRACTION = 12, 0.25  # pairs of adjacent pixels
 _LIGHTER = 0.2  # of the range: white over black
+_MAX_LEFT_FRACTION = 0.2  # of what does not fit of sinusoids as they are labelled
 
 Names = Callable[[int], str]
 """Return the name of a frame by its place."""
@@ -173,12 +175,15 @@ class OrderFault:
     is_sequence: bool = False
 
 
-def find_order_fault(patterns: Sequence[Pattern], relations: FrameRelations, name: Names) -> OrderFault | None:
+def find_order_fault(
+    patterns: Sequence[Pattern], relations: FrameRelations, name: Names, projector: Size | None = None
+) -> OrderFault | None:
     """Explain frames that contradict one another by an order of the frames; None if no order explains them.
 
     patterns : of the frames as they are labelled, each at its place. name : description of a frame by its place.
+    projector : its size, if it is known.
     """
-    checks = _Checks(patterns, relations)
+    checks = _Checks(patterns, relations, projector)
     identity = tuple(range(len(patterns)))
     failures = checks.failures(identity)
     if checks.count < _MIN_TESTS or not failures:
@@ -218,9 +223,13 @@ def find_order_fault(patterns: Sequence[Pattern], relations: FrameRelations, nam
 class _Checks:
     """Tests of an order of frames: order[pattern] is the frame that shows it, -1 for none."""
 
-    def __init__(self, patterns: Sequence[Pattern], relations: FrameRelations) -> None:
+    def __init__(self, patterns: Sequence[Pattern], relations: FrameRelations, projector: Size | None) -> None:
         self.relations = relations
         self._patterns = patterns
+        self._projector = projector
+        self._sine_axes = [axis for axis in Axis if any(isinstance(p, Sine) and p.axis is axis for p in patterns)]
+        self._misfits = dict.fromkeys(self._sine_axes, np.inf)
+        self._misfits = {axis: self._misfit(axis, range(len(patterns)))[0] for axis in self._sine_axes}
         place = {pattern: index for index, pattern in reversed(list(enumerate(patterns)))}
         inverses = {
             place[p]: place[p.inverse]
@@ -229,7 +238,7 @@ class _Checks:
         }
         self.pairs = sorted({(min(pair), max(pair)) for pair in inverses.items()})
         self.flat = [index for index, pattern in enumerate(patterns) if isinstance(pattern, White | Black)]
-        self.count = len(self.pairs) + len(self.flat)
+        self.count = len(self.pairs) + len(self.flat) + sum(isinstance(p, Sine) for p in patterns)
 
     def pair_fails(self, one: int, other: int) -> bool:
         """True if two frames are not complementary, although at least one of them has a pattern."""
@@ -262,10 +271,24 @@ class _Checks:
         words, distance = _differing_words(lit), _CodeDistance(len(lit))
         return _is_closer(distance(words ^ (2 ** len(lit) - 1)), distance(words))
 
+    def _misfit(self, axis: Axis, order: Sequence[int]) -> tuple[float, bool]:
+        """Return what does not fit of the frames of an axis with sinusoids in this order, and whether it is little."""
+        places = [p for p in fitted_patterns(self._patterns, axis) if order[p] >= 0]
+        shown = tuple(self._patterns[p] for p in places)
+        if not any(isinstance(p, Sine) for p in shown):
+            return 0.0, True
+        model = LightModel.of(shown, self._projector and self._projector.along(axis))
+        misfit, limit = order_misfit(self.relations.light[[order[p] for p in places]], model)
+        return misfit, misfit < max(limit, _MAX_LEFT_FRACTION * self._misfits[axis])
+
     def disorder(self, order: Sequence[int]) -> float:
-        """Sum of the distances of adjacent pixels in the codes that frames in this order have."""
+        """Sum of the distances of adjacent pixels in the codes that frames in this order have, and of what does not fit
+        of sinusoids.
+        """
         codes = [self._lit(axis, order) for axis in self.code_axes]
-        return sum(float(_CodeDistance(len(lit))(_differing_words(lit)).sum()) for lit in codes)
+        misfit = sum((self._misfit(axis, order)[0] for axis in self._sine_axes), 0.0)
+        distance = sum(float(_CodeDistance(len(lit))(_differing_words(lit)).sum()) for lit in codes)
+        return float(distance + self.relations.light.shape[1] * misfit)
 
     @property
     def references(self) -> list[tuple[int, int]]:
@@ -298,13 +321,18 @@ class _Checks:
             if a >= 0 and b >= 0 and self.pair_fails(a, b):
                 found.append((one, other))
         found += [(each,) for each in self.flat if order[each] >= 0 and self.flat_fails(each, order)]
+        for axis in self._sine_axes:
+            if not self._misfit(axis, order)[1]:
+                found += [(i,) for i, p in enumerate(self._patterns) if isinstance(p, Sine) and p.axis is axis]
         return found
 
     def agreement(self, order: Sequence[int]) -> str:
         """Describe that all tests pass."""
         pairs = sum(order[one] >= 0 and order[other] >= 0 for one, other in self.pairs)
-        references = " and white and black are where they belong" if self.flat else ""
-        return f"all {pairs} pairs of a pattern and its inverse add up{references}"
+        words = [f"all {pairs} pairs of a pattern and its inverse add up"] if pairs or not self._sine_axes else []
+        words += ["all sinusoids fit one position per pixel"] if self._sine_axes else []
+        words += ["white and black are where they belong"] if self.flat else []
+        return " and ".join(words)
 
 
 def _shifted_orders(count: int) -> Iterator[tuple[tuple[int, ...], str]]:

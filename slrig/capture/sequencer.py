@@ -48,7 +48,8 @@ def capture(
     with all causes; ScanCancelledError: `cancelled` returned True; DeviceError: a device failed or is gone.
     """
     if evidence is None:
-        evidence = Evidence(sequence.patterns, {name: camera.info.format for name, camera in rig.cameras.items()})
+        formats = {name: camera.info.format for name, camera in rig.cameras.items()}
+        evidence = Evidence(sequence.patterns, formats, projector=sequence.projector)
     triggers = choose_triggers(rig)
     with ExitStack() as leaving:
         for camera in rig.cameras.values():

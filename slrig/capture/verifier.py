@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.bundle import RefusedFrame
-from slrig.capture import frame_checks, frame_light, frame_order
+from slrig.capture import frame_checks, frame_light, frame_order, sine_evidence
+from slrig.capture.findings import CameraFindings
 from slrig.capture.frame_checks import (
     Contradiction,
     DecodedCode,
@@ -35,6 +36,7 @@ from slrig.model import (
     Pixels,
     Primary,
     Shot,
+    Sine,
     Size,
     White,
     coarse_bit_count,
@@ -83,49 +85,6 @@ class Sampler:
         return np.asarray(image.reshape(-1)[self.flat], dtype=np.float32)
 
 
-@dataclass(slots=True)
-class CameraFindings:
-    """Conclusions from the frames of one camera. They follow from the frames alone and are rebuilt when a frame is
-    retracted.
-
-    first_seen_index : index of the first frame of each pattern. verified : patterns whose frames passed a test that
-    another pattern would fail. noises : DN, one for each pair. sums : bit + inverse of the last pair. pending_lines :
-    line frames that wait for the code. light_drift : largest change of the light between two frames of one pattern,
-    relative to white. reference_confirmed : a pair of a bit or lines and their inverses added up to white and black,
-    which confirms these two. verified_axes : axes with a line frame that agreed with the Gray code, which confirms the
-    code. lights : light of frames that agree only after it is undone; measured_factors : factor of the light of all
-    frames that determine it. fitted_lights : as well as it is known, for comparison within a pair or the line frames of
-    an axis. linear_edges : for each pair with edges, whether they show a linear response.
-    """
-
-    first_seen_index: dict[Pattern, int] = field(default_factory=dict)
-    verified: set[int] = field(default_factory=set)
-    noises: list[float] = field(default_factory=list)
-    sums: list[Samples] = field(default_factory=list)
-    codes: dict[Axis, tuple[DecodedCode, Gray]] = field(default_factory=dict)
-    pending_lines: list[int] = field(default_factory=list)
-    light_drift: float | None = None
-    reference_confirmed: bool = False
-    verified_axes: set[Axis] = field(default_factory=set)
-    lights: dict[int, FrameLight] = field(default_factory=dict)
-    measured_factors: dict[int, float] = field(default_factory=dict)
-    fitted_lights: dict[int, FrameLight] = field(default_factory=dict)
-    linear_edges: list[bool] = field(default_factory=list)
-
-    @property
-    def usual_factor(self) -> float:
-        """Median factor of the light of the frames whose inverses determine it; 1 without such frames."""
-        return float(np.median(list(self.measured_factors.values()))) if self.measured_factors else 1.0
-
-    @property
-    def noise_dn(self) -> float | None:
-        """Noise of a frame, DN; None without pairs.
-
-        This is the minimum over all pairs, because finer bits behind a scaler do not add up exactly.
-        """
-        return min(self.noises, default=None)
-
-
 class FrameVerifier:
     """Verifies the frames of one camera.
 
@@ -133,10 +92,16 @@ class FrameVerifier:
     """
 
     def __init__(
-        self, name: str, form: CameraFormat, patterns: Sequence[Pattern], frame_names: Sequence[str] | None = None
+        self,
+        name: str,
+        form: CameraFormat,
+        patterns: Sequence[Pattern],
+        frame_names: Sequence[str] | None = None,
+        projector: Size | None = None,
     ) -> None:
         self.name = name
         self._frame_names = frame_names
+        self._projector = projector
         self.lighting: Lighting | None = None
         self.reported: list[Contradiction] = []
         self.pattern_indices: set[int] = set()
@@ -195,14 +160,15 @@ class FrameVerifier:
 
     def findings_summary(self) -> CameraSummary:
         """Return what all frames prove: each cause once, and the frames that are proven wrong."""
-        order = self._order_fault() if self.reported else None
+        reported = self.findings.settled(self.reported)
+        order = None if self.findings.explains(reported) else self._order_fault()
         if order is not None and order.is_sequence:
             return CameraSummary((f"camera '{self.name}': {order.cause}",), frozenset(), order.cause)
         if order is None:
-            wrong = {index for each in self.reported for index in each.wrong}
-            return CameraSummary(summarise(self.reported, self._patterns), frozenset(wrong))
+            wrong = {index for each in reported for index in each.wrong}
+            return CameraSummary(summarise(reported, self._patterns), frozenset(wrong))
         # Other contradictions of these frames are caused by them.
-        others = [each for each in self.reported if order.shows.keys().isdisjoint(each.suspects)]
+        others = [each for each in reported if order.shows.keys().isdisjoint(each.suspects)]
         wrong = {*order.shows, *(index for each in others for index in each.wrong)}
         faults = (f"camera '{self.name}': {order.cause}", *summarise(others, self._patterns))
         return CameraSummary(faults, frozenset(wrong))
@@ -219,6 +185,7 @@ class FrameVerifier:
             self._patterns,
             relations,
             lambda index: describe_pattern(index, self._patterns[index]) if names is None else names[index],
+            self._projector,
         )
 
     def light_factors(self) -> dict[str, LightFactor]:
@@ -265,6 +232,7 @@ class FrameVerifier:
             self.findings.first_seen_index.setdefault(self._patterns[index], index)
             if index in waiting:
                 self._pending[index] = waiting[index]
+                found += self._check_unreferenced(index)
             else:
                 self._samples[index] = frames[index]
                 if index in self._references:
@@ -278,9 +246,17 @@ class FrameVerifier:
         self._overview[index] = self._whole_image.take(image)
         if self._sampler is None:
             self._pending[index] = image
-            return [] if self._reference_rejected else self._set_reference()
+            found = [] if self._reference_rejected else self._set_reference()
+            return found or self._check_unreferenced(index)
         self._samples[index] = self._sampler.take(image)
         return self._check_against_reference(index)
+
+    def _check_unreferenced(self, index: int) -> list[Contradiction]:
+        """Check a frame of a sequence without white or black: sinusoids need neither."""
+        pattern = self._patterns[index]
+        if {White(), Black()} <= set(self._patterns) or not isinstance(pattern, Gray | Sine):
+            return []
+        return self._check_sines(pattern, [])
 
     def _format_fault(self, shot: Shot) -> str | None:
         image, size = shot.image, self._format.size
@@ -370,6 +346,8 @@ class FrameVerifier:
             found += self._check_code(pattern, ref)
         if not found:
             found += self._check_repetition(index, pattern, ref)
+        if isinstance(pattern, Gray | Sine):
+            found += self._check_sines(pattern, found)
         if not found and isinstance(pattern, LineShift):
             found += self._check_line(index, pattern, ref) or self._check_line_set(pattern.axis, ref)
         # Frames cannot distinguish two primaries, because an object may reflect both equally.
@@ -718,6 +696,33 @@ class FrameVerifier:
             self.findings.verified_axes.add(pattern.axis)
         return []
 
+    def _check_sines(self, pattern: Gray | Sine, found: Sequence[Contradiction]) -> list[Contradiction]:
+        """Check the frames of an axis against one position per pixel, as soon as a period of sinusoids is complete."""
+        findings = self.findings
+        sampler, known = (self._sampler, self._samples) if self._sampler else (self._whole_image, self._overview)
+        frames = {i: known[i] for i in findings.first_seen_index.values() if i in known}
+        if not sine_evidence.is_due(self._patterns, pattern, frames.keys()):
+            return []
+        is_last = sine_evidence.is_complete(self._patterns, pattern.axis, frames.keys())
+        if found and not is_last:
+            return []
+        agreement = sine_evidence.check_axis(
+            self._patterns, pattern.axis, frames, row=sampler.row, full_scale=self._format.full_scale,
+            projector=self._projector,
+        )  # fmt: skip
+        findings.verified |= agreement.verified
+        findings.lights.update(agreement.lights)
+        findings.fitted_lights.update(agreement.lights)
+        new = [
+            self._contradiction(each.index, each.cause, each.suspects, agreement.members, wrong=each.wrong)
+            for each in agreement.faults
+        ]
+        if is_last:
+            findings.agreements[pattern.axis] = new
+        else:
+            findings.interim_agreements.setdefault(pattern.axis, []).extend(new)
+        return new
+
     def _check_line_light(
         self, family: Sequence[LineShift], members: Sequence[int], frames: Sequence[Samples], ref: ReferenceFrames
     ) -> list[Contradiction]:
@@ -792,6 +797,8 @@ def _code_parameters(pattern: Gray) -> tuple[Axis, int, int, int]:
 def _kind_of_light(pattern: Pattern) -> str:
     if isinstance(pattern, Gray):
         return f"{pattern.axis} Gray code"
+    if isinstance(pattern, Sine):
+        return f"{pattern.axis} sinusoids"
     return f"{pattern.axis} lines" if isinstance(pattern, LineShift) else pattern.kind
 
 
@@ -893,7 +900,8 @@ class Evidence:
     """Verification of one sequence by all its frames, in any order; starting with white and black saves memory.
 
     patterns : the whole sequence. cameras : all cameras. refused : exposures already rejected. frame_names : by camera,
-    what messages on the order of the frames call the frame of each pattern; None: the pattern.
+    what messages on the order of the frames call the frame of each pattern; None: the pattern. projector : its size,
+    which sinusoids without a code need to number their periods as far as it goes and no further.
     """
 
     def __init__(
@@ -903,8 +911,10 @@ class Evidence:
         refused: Sequence[RefusedFrame] = (),
         *,
         frame_names: Mapping[str, Sequence[str]] | None = None,
+        projector: Size | None = None,
     ) -> None:
         self._frame_names = frame_names or {}
+        self._projector = projector
         self._patterns = tuple(patterns)
         self._cameras = dict(cameras)
         self._refused = [replace(each, shot=None) for each in refused if each.pattern < len(self._patterns)]
@@ -931,7 +941,7 @@ class Evidence:
         """Remove all frames. The record of rejected exposures remains."""
         previous = self._verifiers
         self._verifiers = {
-            name: FrameVerifier(name, form, self._patterns, self._frame_names.get(name))
+            name: FrameVerifier(name, form, self._patterns, self._frame_names.get(name), self._projector)
             for name, form in self._cameras.items()
         }
         for name, each in previous.items():
@@ -970,7 +980,7 @@ def check_capture(capture: Capture, refused: Sequence[RefusedFrame] = ()) -> Evi
     If a pattern has several exposure times, the one that most patterns share is checked. refused : exposures rejected
     during the capture.
     """
-    evidence = Evidence(capture.patterns, capture.cameras, refused)
+    evidence = Evidence(capture.patterns, capture.cameras, refused, projector=capture.projector)
     for index in checked_frames(capture):
         evidence.add_shot(capture.shots[index])
     return evidence.summary()

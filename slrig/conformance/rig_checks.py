@@ -161,7 +161,7 @@ class _SteppingProjector:
 
 def _expect_verified(bench: RigBench, rig: Rig) -> None:
     formats = {name: camera.info.format for name, camera in rig.cameras.items()}
-    evidence = Evidence(bench.sequence.patterns, formats)
+    evidence = Evidence(bench.sequence.patterns, formats, projector=bench.sequence.projector)
     shots = list(capture(rig, bench.sequence, evidence=evidence))
     captured = {(shot.pattern, shot.camera) for shot in shots}
     missing = [

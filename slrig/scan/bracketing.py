@@ -136,7 +136,9 @@ class Exposing:
         self._skip(exposure_s, set(self._formats) - set(cameras))
         while taking:
             formats = {name: self._formats[name] for name in taking}
-            run = _BracketRun(exposure_s, Evidence(self._sequence.patterns, formats))
+            run = _BracketRun(
+                exposure_s, Evidence(self._sequence.patterns, formats, projector=self._sequence.projector)
+            )
             try:
                 yield from self._run(run, taking, since_ns)
             except ScanEvidenceError as error:

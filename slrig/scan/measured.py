@@ -364,7 +364,7 @@ def _streamed(
         region=region,
         drop_finest_bits=drop_finest_bits,
     )
-    evidence = Evidence(capture.patterns, capture.cameras, refused)
+    evidence = Evidence(capture.patterns, capture.cameras, refused, projector=capture.projector)
     for index, shot in zip(order, shots, strict=True):
         stream.take(shot)
         if proven is None and one_exposure and index in judged:

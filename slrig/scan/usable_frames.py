@@ -1,21 +1,24 @@
 """Frames as reconstruction may use them: those that are proven wrong count as missing, unequal light is evened out.
 
-A bit is rebuilt from its inverse, other wrong frames are left out. Where the light changed between a bit and its
-inverse, or between line frames, which displaces their edges, all frames are brought to the light of white and black.
+A bit is rebuilt from its inverse, a sinusoid from its other shifts, other wrong frames are left out. Where the light
+changed between a bit and its inverse, or between frames of lines or sinusoids, which displaces their edges and phases,
+all frames are brought to the light of white and black.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slrig.bundle import BundleFiles
 from slrig.capture import EvidenceSummary, FrameLight, describe_indices
-from slrig.model import Axis, Black, Capture, Gray, LineShift, Pixels, Shot, White
+from slrig.model import MIN_LINE_STEPS, Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, Shot, Sine, White
 
+_MIN_LIT_FRACTION = 0.2  # of the 99th percentile of white − black
 _MIN_LIGHT_RATIO = 1.05  # of two frames of a pair; a smaller one displaces edges by less than noise does
 
 
@@ -27,6 +30,30 @@ class _Sources:
     white: int
     black: int
     light: float
+
+    def image(self, read: Callable[[Sequence[int]], list[Pixels]], full_scale: int) -> Pixels:
+        """Return the frame. read : returns the images of frames."""
+        inverse, white, black = read([self.inverse, self.white, self.black])
+        return rebuilt_image(inverse, white, black, light=self.light, full_scale=full_scale)
+
+
+@dataclass(frozen=True, slots=True)
+class _SineSources:
+    """Frames, by index, from which a frame of a sinusoid is rebuilt: its other shifts, and those whose mean is the mean
+    light of all shifts, either all shifts of another period, or white and black and half of the other shifts.
+    """
+
+    others: tuple[int, ...]
+    mean_of: tuple[int, ...]
+    references: tuple[int, int] | None = None
+
+    def image(self, read: Callable[[Sequence[int]], list[Pixels]], full_scale: int) -> Pixels:
+        """Return the frame. read : returns the images of frames."""
+        mean = np.asarray(np.mean(np.stack(read(self.mean_of)), axis=0, dtype=np.float32))
+        if self.references is not None:
+            white, black = (image.astype(np.float32) for image in read(self.references))
+            mean = mean_of_shifts(mean, white, black)
+        return rebuilt_sinusoid(read(self.others), mean, full_scale=full_scale)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +68,7 @@ class UsableFiles:
     whole: BundleFiles
     outline: Capture
     places: tuple[int, ...]
-    rebuilt: Mapping[int, _Sources]
+    rebuilt: Mapping[int, _Sources | _SineSources]
     evened: Mapping[int, tuple[FrameLight, int]]
     note: str
 
@@ -64,10 +91,13 @@ class UsableFiles:
             if sources is None:
                 yield shot
                 continue
-            indices = [sources.inverse, sources.white, sources.black]
-            inverse, white, black = (each.image for each in self.whole.shots(indices, colour=False))
             full_scale = self.outline.cameras[shot.camera].full_scale
-            yield replace(shot, image=rebuilt_image(inverse, white, black, light=sources.light, full_scale=full_scale))
+            yield replace(shot, image=sources.image(self._images, full_scale))
+
+    def _images(self, places: Sequence[int]) -> list[Pixels]:
+        """Return the images with these indices of the whole bundle, in their order."""
+        found = {place: next(iter(self.whole.shots([place], colour=False))).image for place in places}
+        return [found[place] for place in places]
 
 
 def rebuilt_image(inverse: Pixels, white: Pixels, black: Pixels, *, light: float, full_scale: int) -> Pixels:
@@ -77,6 +107,27 @@ def rebuilt_image(inverse: Pixels, white: Pixels, black: Pixels, *, light: float
     dark = black.astype(np.float32)
     image = 2 * dark + np.float32(light) * (white - dark) - inverse
     return np.asarray(np.clip(np.rint(image), 0, full_scale).astype(inverse.dtype))
+
+
+def rebuilt_sinusoid(others: Sequence[Pixels], mean: NDArray[np.float32], *, full_scale: int) -> Pixels:
+    """Return the frame of one of N shifts from those of the others, (H, W) each: N shifts add up to N times the mean.
+
+    mean : (H, W), mean light of all shifts, with what harmonics that gamma adds to it.
+    """
+    image = (len(others) + 1) * mean - np.sum(np.stack(others), axis=0, dtype=np.float32)
+    return np.asarray(np.clip(np.rint(image), 0, full_scale).astype(others[0].dtype))
+
+
+def mean_of_shifts(
+    some: NDArray[np.float32], white: NDArray[np.float32], black: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return the mean light of all shifts, (H, W), from the mean of shifts half a period apart, whose harmonics change
+    from pixel to pixel: the part of white is the same everywhere.
+    """
+    contrast = white - black
+    lit = contrast >= max(2.0, _MIN_LIT_FRACTION * float(np.percentile(contrast, 99)))
+    part = float(np.median((some - black)[lit] / contrast[lit])) if lit.any() else 0.5
+    return np.asarray(black + np.float32(part) * contrast, dtype=np.float32)
 
 
 def evened_image(image: Pixels, black: Pixels, light: FrameLight) -> Pixels:
@@ -108,19 +159,33 @@ def usable_files(files: BundleFiles, evidence: EvidenceSummary, axis: Axis | Non
     rebuilt = {index: sources for index in wrong if (sources := _sources(outline, index, wrong, evidence)) is not None}
     places = tuple(index for index in range(len(outline.shots)) if index not in wrong - rebuilt.keys())
     left = replace(outline, shots=tuple(outline.shots[index] for index in places))
-    fates = {"rebuilt from the inverse, white and black": rebuilt.keys(), "left out": wrong - rebuilt.keys()}
+    sines = {index for index, sources in rebuilt.items() if isinstance(sources, _SineSources)}
+    fates = {
+        "rebuilt from the inverse, white and black": rebuilt.keys() - sines,
+        "rebuilt from the other shifts": sines,
+        "left out": wrong - rebuilt.keys(),
+    }
     note = "; ".join(_describe(outline, indices, fate) for fate, indices in fates.items() if indices)
     return UsableFiles(files, left, places, rebuilt, evened, note)
 
 
 def _concerns(outline: Capture, shot: Shot, axis: Axis | None) -> bool:
     pattern = outline.patterns[shot.pattern]
-    return not isinstance(pattern, Gray | LineShift) or axis in (None, pattern.axis)
+    return not isinstance(pattern, Gray | LineShift | Sine) or axis in (None, pattern.axis)
 
 
-def _sources(outline: Capture, index: int, wrong: Collection[int], evidence: EvidenceSummary) -> _Sources | None:
+def _sources(
+    outline: Capture, index: int, wrong: Collection[int], evidence: EvidenceSummary
+) -> _Sources | _SineSources | None:
     """Return the frames from which a wrong one can be rebuilt; None if one of them is not there, or wrong too."""
     camera, pattern = outline.shots[index].camera, outline.patterns[outline.shots[index].pattern]
+    if isinstance(pattern, Sine):
+        right = {
+            outline.patterns[shot.pattern]: place
+            for place, shot in reversed(list(enumerate(outline.shots)))
+            if place not in wrong and shot.camera == camera
+        }
+        return _sine_sources(pattern, right)
     if not isinstance(pattern, Gray):
         return None
     found: list[int] = []
@@ -135,6 +200,25 @@ def _sources(outline: Capture, index: int, wrong: Collection[int], evidence: Evi
     return _Sources(found[0], found[1], found[2], 1.0 if light is None else light.median)
 
 
+def _sine_sources(pattern: Sine, right: Mapping[Pattern, int]) -> _SineSources | None:
+    """Return the frames from which a sinusoid can be rebuilt. right : index of the right frame of each pattern."""
+    others = [replace(pattern, shift=shift) for shift in range(pattern.steps) if shift != pattern.shift]
+    if pattern.steps < MIN_LINE_STEPS or any(each not in right for each in others):
+        return None
+    places = tuple(right[each] for each in others)
+    for each in right:
+        if not isinstance(each, Sine) or each.axis is not pattern.axis or each.steps < MIN_LINE_STEPS:
+            continue
+        whole = [replace(each, shift=shift) for shift in range(each.steps)]
+        if all(shifted in right for shifted in whole):
+            return _SineSources(places, tuple(right[shifted] for shifted in whole))
+    white, black = right.get(White()), right.get(Black())
+    if pattern.inverse is None or pattern.steps < 4 or white is None or black is None:
+        return None
+    pairs = tuple(right[each] for each in others if each != pattern.inverse)
+    return _SineSources(places, pairs, (white, black))
+
+
 def _evened(
     outline: Capture, camera: str, wrong: Collection[int], axis: Axis | None, lights: Mapping[int, FrameLight]
 ) -> dict[int, tuple[FrameLight, int]]:
@@ -147,7 +231,7 @@ def _evened(
             continue
         if isinstance(pattern, Black) and black < 0:
             black = place
-        if isinstance(pattern, Gray | LineShift) and shot.pattern in lights and _concerns(outline, shot, axis):
+        if isinstance(pattern, Gray | LineShift | Sine) and shot.pattern in lights and _concerns(outline, shot, axis):
             group = (pattern.axis, pattern.bit) if isinstance(pattern, Gray) else pattern.axis
             groups.setdefault(group, {})[place] = lights[shot.pattern]
     factors = [[each.factor for each in frames.values()] for frames in groups.values()]

@@ -1,8 +1,9 @@
-"""Frames that are stale, exchanged or damaged, in scans of scenes whose light is worse in one way each: how many pass.
+"""Frames that are stale, exchanged, torn or damaged, in scans of scenes whose light is worse in one way each: how many
+pass.
 
-`python -m tests.bench.fault_campaign --sequence fast --faults 2000` prints a row for each kind of fault. A fault counts
-as passed if nothing contradicts it and the frame is nearer to another pattern or damaged by the measure of the drivers'
-contract; frames of sound scans that something contradicts are false alarms.
+`python -m tests.bench.fault_campaign --sequence fast --faults 2000` prints a row for each kind of fault; the names of
+`sinusoids` play those. A fault counts as passed if nothing contradicts it and the frame is nearer to another pattern or
+damaged by the measure of the drivers' contract; frames of sound scans that something contradicts are false alarms.
 """
 
 from __future__ import annotations
@@ -18,7 +19,21 @@ import numpy as np
 import structlog
 
 from slrig.capture.verifier import check_capture
-from slrig.model import Capture, PatternSequence, Pixels, SequenceName, Shot
+from slrig.model import (
+    Axis,
+    Black,
+    Capture,
+    Gray,
+    Pattern,
+    PatternSequence,
+    Pixels,
+    SequenceName,
+    Shot,
+    Sine,
+    Size,
+    White,
+)
+from slrig.patterns import encode, gray_bits
 from slrig.scan.plan import PatternPlan
 from slrig.scan.plan_check import pattern_sequence
 from tests.bench.line_sweep import scenes
@@ -80,12 +95,58 @@ def damaged(_: LitScene, __: PatternSequence, shots: list[Shot], rng: np.random.
     return f"{count} of {rows} rows {_DAMAGES[kind]}", [index]
 
 
-FAULTS: dict[str, Fault] = {"stale": stale, "exchanged": exchanged, "damaged": damaged}
+def torn(_: LitScene, __: PatternSequence, shots: list[Shot], rng: np.random.Generator) -> tuple[str, list[int]]:
+    """The upper rows of a frame show the frame before, or the lower ones the next."""
+    index, is_next = int(rng.integers(1, len(shots) - 1)), bool(rng.integers(0, 2))
+    image, rows = shots[index].image, len(shots[index].image)
+    first = int(rng.uniform(0.15, 0.85) * rows)
+    above, below = (image, shots[index + 1].image) if is_next else (shots[index - 1].image, image)
+    _with_image(shots, index, np.concatenate([above[:first], below[first:]]))
+    return f"from row {first} on", [index]
+
+
+def one_off(_: LitScene, __: PatternSequence, shots: list[Shot], rng: np.random.Generator) -> tuple[str, list[int]]:
+    """A frame is missing, or is there twice, so that all later ones are one off."""
+    index = int(rng.integers(1, len(shots) - 1))
+    before = [shot.image for shot in shots]
+    is_missing = bool(rng.integers(0, 2))
+    after = (
+        [*before[:index], *before[index + 1 :], before[-1]]
+        if is_missing
+        else [*before[:index], *before[index - 1 : -1]]
+    )
+    for place, image in enumerate(after):
+        _with_image(shots, place, image)
+    return f"{'missing' if is_missing else 'twice'} at {index}", list(range(index, len(shots)))
+
+
+FAULTS: dict[str, Fault] = {
+    "stale": stale, "exchanged": exchanged, "damaged": damaged, "torn": torn, "one off": one_off,
+}  # fmt: skip
+
+
+def sinusoids(size: Size) -> dict[str, tuple[Pattern, ...]]:
+    """Sequences of sinusoids, by name."""
+    width_px = float(size.width_px)
+
+    def shifted(period_px: float, steps: int) -> list[Pattern]:
+        return [Sine(Axis.COLUMN, period_px, shift, steps) for shift in range(steps)]
+
+    bits = gray_bits(size.width_px, 8, 0)
+    ends: list[Pattern] = [White(), Black()]
+    singles = [Sine(Axis.COLUMN, period_px, 0, 1) for period_px in (23.5, 25.0, 26.0, 28.0, 21.0, 31.0)]
+    return {
+        "3 x 4": (*ends, *shifted(width_px, 4), *shifted(width_px / 8, 4), *shifted(16.0, 4)),
+        "2x3": (*ends, *shifted(width_px, 3), *shifted(width_px / 20, 3)),
+        "code and 4": (*ends, *(Gray(Axis.COLUMN, bit, bits, 8) for bit in range(bits)), *shifted(16.0, 4)),
+        "micro": (*ends, *shifted(24.0, 3), *singles),
+        "without white": (*shifted(width_px, 4), *shifted(width_px / 8, 4), *shifted(16.0, 4)),
+    }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--sequence", default="standard", choices=list(SequenceName))
+    parser.add_argument("--sequence", default="standard", choices=[*SequenceName, *sinusoids(Size(64, 64))])
     parser.add_argument("--faults", type=int, default=2000)
     parser.add_argument("--sound", type=int, default=500)
     parser.add_argument("--only")
@@ -95,7 +156,12 @@ def main() -> None:
     rng = np.random.default_rng(41)
     totals: Counter[str] = Counter()
     for name, scene in stands.items():
-        sequence = pattern_sequence(PatternPlan(sequence=SequenceName(asked.sequence)), scene.projector)
+        named = sinusoids(scene.projector).get(asked.sequence)
+        sequence = (
+            pattern_sequence(PatternPlan(sequence=SequenceName(asked.sequence)), scene.projector)
+            if named is None
+            else encode(named, scene.projector)
+        )
         totals.update(
             _campaign(name, scene, sequence, asked.faults // len(stands) + 1, asked.sound // len(stands) + 1, rng)
         )

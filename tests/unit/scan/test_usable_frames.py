@@ -11,7 +11,7 @@ import pytest
 
 from slrig.bundle import BundleFiles, open_bundle, write_bundle
 from slrig.capture.verifier import EvidenceSummary, check_capture
-from slrig.model import Axis, Capture, Gray, LineShift, Pattern, Pixels, Shot, White
+from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, Shot, Sine, White
 from slrig.scan.usable_frames import UsableFiles, rebuilt_image, usable_files
 from tests.unit.capture.fake_rig import PROJECTOR, Scene, patterns_for
 
@@ -98,3 +98,39 @@ def test_a_rebuilt_bit_has_the_light_of_its_inverse(light: float) -> None:
     assert found.dtype == np.uint8
     np.testing.assert_allclose(found, 20 + light * 130 * share, atol=1)
     assert isinstance(PATTERNS[0], White)
+
+
+# ---- sinusoids
+
+
+def shifted(period_px: float, steps: int) -> tuple[Pattern, ...]:
+    return tuple(Sine(Axis.COLUMN, period_px, shift, steps) for shift in range(steps))
+
+
+@pytest.mark.parametrize(
+    "patterns",
+    [
+        (White(), Black(), *shifted(128, 4), *shifted(16, 4)),
+        (White(), Black(), *shifted(128, 3), *shifted(16, 3)),
+        (*shifted(128, 4), *shifted(16, 4)),
+        (White(), Black(), *(Gray(Axis.COLUMN, bit, 4, 8) for bit in range(4)), *shifted(16, 4)),
+    ],
+    ids=["two of four", "2x3", "without white and black", "a code and four"],
+)
+@pytest.mark.parametrize("scaler_px", [0.0, 0.7])
+def test_a_wrong_sinusoid_is_rebuilt_from_its_other_shifts(
+    tmp_path: Path, patterns: tuple[Pattern, ...], scaler_px: float
+) -> None:
+    """Also with a projector whose gamma is 2.2."""
+    scene = Scene(noise_dn=1.0, scaler_px=scaler_px)
+    right, wrong = scene.shots(patterns), len(patterns) - 2
+    shots = [replace(shot, image=right[wrong - 1].image) if shot.pattern == wrong else shot for shot in right]
+    capture = Capture(PROJECTOR, patterns, {"left": scene.format}, tuple(shots))
+    write_bundle(tmp_path / "b", capture, None)
+    evidence = check_capture(capture)
+    assert evidence.wrong == {"left": frozenset({wrong})}
+    usable = usable_files(open_bundle(tmp_path / "b"), evidence, Axis.COLUMN)
+    assert usable is not None
+    assert usable.note == f"frames not used: {wrong} of camera 'left', rebuilt from the other shifts"
+    difference = images(usable)[wrong].astype(int) - right[wrong].image
+    assert np.percentile(np.abs(difference), 99) < 15
