@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,9 +28,10 @@ from slrig.patterns import cell_positions, index_of_word, level_lines, line_posi
 from slrig.reconstruction.decoded_image import CodeTables, ReconstructionLimits
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames, axis_frames, axis_patterns
+from slrig.reconstruction.fusion import fuse_exposures
 from slrig.reconstruction.pipeline import camera_curves
 from slrig.reconstruction.second_axis import decode_second_axis
-from slrig.reconstruction.sinusoids import SinusoidMap, locate_sinusoids, mean_light
+from slrig.reconstruction.sinusoids import SinusoidMap, decode_sinusoids, locate_sinusoids, mean_light
 from tests.unit.reconstruction.builders import grid, rms, seen_by_camera
 
 PROJECTOR_PX = 1024
@@ -236,3 +238,22 @@ def test_a_second_axis_of_sinusoids_has_their_positions() -> None:
     error_px = second.positions.position_px - position_px
     assert np.isfinite(error_px).mean() > 0.99
     assert rms(error_px[np.isfinite(error_px)]) < 0.1
+
+
+def test_a_bracket_of_sinusoids_measures_what_its_longest_exposure_clips() -> None:
+    x, y = grid((60, 120))
+    position_px = 10 + 0.8 * x + 0.03 * y
+    long, short = (
+        seen_by_camera(position_px, played((16.0, 4), (128 / 7, 4)), Size(128, 96), white=white)
+        for white in (320.0, 80.0)
+    )
+    shots = [replace(each, exposure_s=0.04) for each in long.shots]
+    shots += [replace(each, exposure_s=0.01) for each in short.shots]
+    clipped = np.max([each.image for each in long.shots], axis=0) == 255
+    fused = fuse_exposures(replace(long, shots=tuple(shots)), "eye", Axis.COLUMN)
+    limits = ReconstructionLimits().decoding
+    found = decode_sinusoids(fused.frames, fused.noise, np.zeros(2, np.int32), 128, limits)
+    error_px = (found.measured.position - position_px)[:, 5:-5]
+    assert clipped.mean() > 0.2
+    assert np.isfinite(error_px[clipped[:, 5:-5]]).mean() > 0.95
+    assert rms(error_px[np.isfinite(error_px)]) < 0.15
