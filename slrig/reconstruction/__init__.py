@@ -60,7 +60,7 @@ from slrig.reconstruction.redundancy import (
     sheet_coordinates,
 )
 from slrig.reconstruction.second_axis import AxisPositions, axis_residuals, decode_second_axis
-from slrig.reconstruction.sinusoids import SinusoidResponse
+from slrig.reconstruction.sinusoids import SinusoidResponse, decode_sinusoids
 from slrig.reconstruction.triangulation import (
     CONVERGED,
     SheetCurves,
@@ -131,6 +131,7 @@ __all__ = [
     "check_calibration",
     "decode_edges",
     "decode_second_axis",
+    "decode_sinusoids",
     "distorted_from_pixel",
     "estimate_albedo",
     "estimate_noise",

@@ -137,8 +137,8 @@ def _longest_exposure_loss(
     spread = np.sqrt(noise.variance(longest.white) + noise.variance(longest.black))
     lit = longest.usable & (longest.white - longest.black > _MIN_CONTRAST_SIGMA * spread)
     code = [longest.images[each] for each in patterns.required if isinstance(each, Gray)]
-    fine = [longest.images[each] for each in patterns.lines or patterns.sines]
-    return compression_loss(fine or code, code or fine, lit, full_scale)
+    code = code or [longest.images[each] for each in patterns.sines]
+    return compression_loss([longest.images[each] for each in patterns.lines] or code, code, lit, full_scale)
 
 
 def _common_exposures(images: Mapping[Pattern, Mapping[float | None, object]], camera: str) -> FloatArray:
