@@ -63,7 +63,7 @@ from slrig.reconstruction.redundancy import (
     sheet_coordinates,
 )
 from slrig.reconstruction.second_axis import AxisPositions, axis_residuals, decode_second_axis
-from slrig.reconstruction.sinusoids import SinusoidResponse
+from slrig.reconstruction.sinusoids import SinusoidResponse, decode_sinusoids
 from slrig.reconstruction.triangulation import (
     CONVERGED,
     SheetCurves,
@@ -135,6 +135,7 @@ __all__ = [
     "decode_edges",
     "decode_second_axis",
     "disagreement_px",
+    "decode_sinusoids",
     "distorted_from_pixel",
     "estimate_albedo",
     "estimate_noise",

@@ -246,7 +246,9 @@ def estimate_blur(
     accept it as known.
     """
     images, angle, period_px = frames.phase_frames
-    radians_per_px = 2 * np.pi / period_px
+    # White and black by the modulation of a coarser period lose some of it, too.
+    reference_px = np.inf if frames.has_reference else max(each.period_px for each in frames.sine_patterns)
+    radians_per_px = 2 * np.pi * float(np.sqrt(max(period_px**-2 - reference_px**-2, 0.0)))
     height, width = measured.position.shape
 
     def shifted(rows: int, columns: int) -> tuple[slice, slice]:
@@ -268,9 +270,7 @@ def estimate_blur(
     even = known & (edge < _MAX_CONTRAST_STEP * contrast)
     if np.count_nonzero(even) >= _MIN_SAMPLES:
         known = even
-    # White and black by the modulation itself do not show what it loses.
-    shows_blur = frames.has_reference or len({each.period_px for each in frames.sine_patterns}) > 1
-    if not shows_blur or expected_px <= 0 or np.count_nonzero(known) < _MIN_SAMPLES:
+    if radians_per_px == 0 or expected_px <= 0 or np.count_nonzero(known) < _MIN_SAMPLES:
         return BlurEstimate(expected_px, from_lines=False)
     expected_fall, log_amplitude = -0.5 * radians_per_px**2 * squared[known], np.log(amplitude[known] / contrast[known])
     inliers = np.ones(len(expected_fall), dtype=np.bool_)

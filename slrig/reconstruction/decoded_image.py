@@ -18,7 +18,7 @@ from slrig.reconstruction.camera_response import (
     estimate_noise,
     frame_compression_loss,
 )
-from slrig.reconstruction.decoding import CodeMap, DecodingLimits, lit_pixels
+from slrig.reconstruction.decoding import CodeMap, DecodingLimits, lit_pixels, unread_code
 from slrig.reconstruction.frames import (
     AxisFrames,
     FrameStacks,
@@ -148,10 +148,8 @@ def undecoded_image(frames: AxisFrames, response: CameraResponse, limits: Recons
     noise = response.noise
     lit = lit_pixels(frames, noise, limits.decoding)
     variance = noise.variance(frames.white) + noise.variance(frames.black)
-    no_cells = np.broadcast_to(np.int32(-1), lit.shape)
     return DecodedImage(
-        frames, response,
-        CodeMap(no_cells, no_cells, np.where(lit, np.uint8(Refusal.NONE), np.uint8(Refusal.NOT_LIT))),
+        frames, response, unread_code(lit),
         near_shadow=near_shadows(~lit, limits.edges),
         contrast_deviation=np.sqrt(variance / np.float32(frames.reference_repeats)),
     )  # fmt: skip

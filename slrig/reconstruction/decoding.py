@@ -103,6 +103,12 @@ class CodeMap(NamedTuple):
         return np.where(self.refusal == 0, middle, np.nan)
 
 
+def unread_code(lit: NDArray[np.bool_], /) -> CodeMap:
+    """Return the map of lit pixels without cells. lit : (H, W) bool."""
+    no_cells = np.broadcast_to(np.int32(-1), lit.shape)
+    return CodeMap(no_cells, no_cells, np.where(lit, np.uint8(Refusal.NONE), np.uint8(Refusal.NOT_LIT)))
+
+
 def lit_pixels(frames: AxisFrames, noise: NoiseModel, limits: DecodingLimits, /) -> NDArray[np.bool_]:
     """(H, W) bool: True where white exceeds black significantly."""
     spread = np.sqrt(noise.variance(frames.white) + noise.variance(frames.black))

@@ -137,6 +137,7 @@ def _longest_exposure_loss(
     spread = np.sqrt(noise.variance(longest.white) + noise.variance(longest.black))
     lit = longest.usable & (longest.white - longest.black > _MIN_CONTRAST_SIGMA * spread)
     code = [longest.images[each] for each in patterns.required if isinstance(each, Gray)]
+    code = code or [longest.images[each] for each in patterns.sines]
     return compression_loss([longest.images[each] for each in patterns.lines] or code, code, lit, full_scale)
 
 

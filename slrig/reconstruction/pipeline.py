@@ -44,6 +44,7 @@ from slrig.reconstruction.decoded_image import (
 )
 from slrig.reconstruction.decoding import (
     CodeMap,
+    DecodingLimits,
     RegionMask,
     cells_beyond,
     decode,
@@ -74,7 +75,7 @@ from slrig.reconstruction.phase import (
     step_sigma_px,
 )
 from slrig.reconstruction.refinement import refine_points
-from slrig.reconstruction.sinusoids import SinusoidResponse, locate_sinusoids
+from slrig.reconstruction.sinusoids import SinusoidResponse, code_cell_count, decode_sinusoids
 from slrig.reconstruction.stripes import LinePoints, StripeLimits, chain_stripes, stripe_points, stripe_width_px
 
 # Chosen: at 0.7 px, narrow stripes are found with three times the error.
@@ -235,9 +236,11 @@ class CameraStream:
         self._has_code = True
         frames, tables = image.frames, self._tables
         unresolved = None
-        given = frames, image.response.noise, tables.index_of_word, _cell_count(frames, tables), self._limits.decoding
+        given = (
+            frames, image.response.noise, tables.index_of_word, len(tables.cell_position), self._limits.decoding
+        )  # fmt: skip
         if frames.sine_patterns:
-            image = _locate_by_sinusoids(image, decode(*given) if len(frames.bits) else image.code, tables)
+            image = _decode_by_sinusoids(image, tables, self._limits.decoding)
             code = image.code
         elif self._stacks.patterns.lines:
             code = decode(*given)
@@ -289,10 +292,10 @@ class CameraStream:
         return _FilterScale(filter_px, blur_px, sampled, rows if sampled else _ALL_ROWS)
 
 
-def _locate_by_sinusoids(image: DecodedImage, code: CodeMap, tables: CodeTables) -> DecodedImage:
+def _decode_by_sinusoids(image: DecodedImage, tables: CodeTables, limits: DecodingLimits) -> DecodedImage:
     """Measure positions by sinusoids, within the cells of the code if there is one."""
     frames, noise = image.frames, image.response.noise
-    found = locate_sinusoids(frames, noise, code, tables.extent_px)
+    found = decode_sinusoids(frames, noise, tables.index_of_word, tables.extent_px, limits)
     period_px = frames.phase_frames[2]
     image = replace(image, code=found.code).with_position_noise(
         frames.sinusoids, sinusoid_pixel_sum(found.measured.position, period_px)
@@ -302,13 +305,6 @@ def _locate_by_sinusoids(image: DecodedImage, code: CodeMap, tables: CodeTables)
     return replace(
         image, sinusoids=found._replace(measured=found.measured._replace(sigma=found.measured.sigma * wider))
     )
-
-
-def _cell_count(frames: AxisFrames, tables: CodeTables) -> int:
-    """Number of cells of the code."""
-    if not frames.sine_patterns:
-        return len(tables.cell_position)
-    return (tables.extent_px - 1 + frames.gray.offset_px) // frames.gray.cell_px + 1
 
 
 def _no_points() -> LinePoints:
@@ -468,7 +464,9 @@ def _refine_identify_link(
     """
     frames, from_surfaces = image.frames, light_from_surfaces(image)
     beyond = cells_beyond(frames, image.code, tables.index_of_word)
-    cell_count = _cell_count(frames, tables)
+    cell_count = len(tables.cell_position)
+    if frames.sine_patterns:
+        cell_count = code_cell_count(frames.gray, tables.extent_px)
     clipped_white, clipped_code = _count_clipped(frames, ~image.unlit)
     report_step("refine stripes")
     aligned = align_points(

@@ -22,6 +22,7 @@ from slrig.reconstruction.decoded_image import CodeTables
 from slrig.reconstruction.decoding import DecodingLimits, decode, decode_edges
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.phase import has_phase, position_map
+from slrig.reconstruction.sinusoids import decode_sinusoids
 from slrig.reconstruction.triangulation import SheetCurves, project
 
 _UNIFORM = 12**-0.5  # standard deviation of a uniform distribution of width 1
@@ -136,7 +137,10 @@ def decode_second_axis(
 ) -> SecondAxis:
     """Decode the projector position of each pixel along the axis of `frames`, which are in proportion to light."""
     given = frames, noise, tables.index_of_word, len(tables.cell_position), limits
-    if has_phase(frames):
+    if frames.sine_patterns:
+        found = decode_sinusoids(frames, noise, tables.index_of_word, tables.extent_px, limits)
+        positions = AxisPositions(*found.measured)
+    elif has_phase(frames):
         positions = AxisPositions(*position_map(frames, noise, decode(*given), tables.cell_position))
     else:
         code, unread = decode_edges(*given)

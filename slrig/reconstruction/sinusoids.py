@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from scipy.special import gammainc, gammaincinv
 
 from slrig.kernels import in_bands, kernel, kernel_part
-from slrig.model import FloatArray, IntArray, NoiseModel, Refusal, Sine, sine_groups
-from slrig.reconstruction.decoding import CodeMap
+from slrig.model import FloatArray, Gray, IntArray, NoiseModel, Refusal, Sine, sine_groups
+from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode, lit_pixels, unread_code
 from slrig.reconstruction.frames import AxisFrames, rows_per_band, sine_weights, stack_rows
 from slrig.reconstruction.phase import PositionMap
 
@@ -202,6 +202,25 @@ class _Found(NamedTuple):
             self.position[rows], self.other[rows], self.sigma[rows], self.swing[rows], self.level[rows],
             self.coarsest[rows], self.misfit[rows], self.advantage[rows], self.refusal[rows],
         )  # fmt: skip
+
+
+def decode_sinusoids(
+    frames: AxisFrames, noise: NoiseModel, index_of_word: IntArray, extent_px: int, limits: DecodingLimits, /
+) -> SinusoidMap:
+    """Read the Gray code, if there is one, and measure the projector position at each pixel.
+
+    index_of_word : as for `decode`; extent_px : of the projector along the axis.
+    """
+    if len(frames.bits):
+        code = decode(frames, noise, index_of_word, code_cell_count(frames.gray, extent_px), limits)
+    else:
+        code = unread_code(lit_pixels(frames, noise, limits))
+    return locate_sinusoids(frames, noise, code, extent_px)
+
+
+def code_cell_count(gray: Gray, extent_px: int, /) -> int:
+    """Number of cells of a code on a projector of this extent."""
+    return (extent_px - 1 + gray.offset_px) // gray.cell_px + 1
 
 
 def locate_sinusoids(frames: AxisFrames, noise: NoiseModel, code: CodeMap, extent_px: int, /) -> SinusoidMap:

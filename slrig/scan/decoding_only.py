@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 from slrig.bundle import read_capture, write_file
 from slrig.disk import storage_errors
 from slrig.errors import PatternError, setting
-from slrig.model import Axis, Capture, Gray, NoiseModel, Refusal, trim_incomplete_codes
-from slrig.patterns import cell_positions, index_of_word
+from slrig.model import Axis, Capture, Gray, NoiseModel, Refusal, Sine, trim_incomplete_codes
+from slrig.patterns import cell_positions, index_of_word, require_numbered
 from slrig.reconstruction import (
     AxisFrames,
     DecodingLimits,
     axis_frames,
     decode_edges,
+    decode_sinusoids,
     estimate_noise,
     exposure_count,
     fuse_exposures,
@@ -93,9 +94,9 @@ def decode_bundle(bundle: Path, output: Path) -> tuple[list[Decoded], tuple[str,
         `output` holds something else, or the disk refused.
     """
     capture, cut_short = trim_incomplete_codes(read_capture(bundle))
-    axes = [axis for axis in Axis if any(isinstance(p, Gray) and p.axis is axis for p in capture.patterns)]
+    axes = [axis for axis in Axis if any(isinstance(p, Gray | Sine) and p.axis is axis for p in capture.patterns)]
     if not axes:
-        message = f"{bundle}: no Gray-code frames: nothing can be decoded"
+        message = f"{bundle}: no frames of Gray code or sinusoids: nothing can be decoded"
         raise PatternError(message)
     with staged_folder(output) as staging:
         found = [_decoded(capture, camera, axis, staging) for camera in capture.cameras for axis in axes]
@@ -114,9 +115,16 @@ def _decoded(capture: Capture, camera: str, axis: Axis, folder: Path) -> Decoded
     frames, noise = _frames(capture, camera, axis)
     limits = DecodingLimits()
     lit = lit_pixels(frames, noise, limits)
-    cells = cell_positions(frames.gray, capture.projector)
-    code, unresolved = decode_edges(frames, noise, index_of_word(frames.gray), len(cells), limits)
-    position = position_map(frames, noise, code, cells).position
+    words = index_of_word(frames.gray)
+    if frames.sine_patterns:
+        if not len(frames.bits):
+            require_numbered(frames.sine_patterns, capture.projector)
+        found = decode_sinusoids(frames, noise, words, capture.projector.along(axis), limits)
+        code, position, unresolved = found.code, found.measured.position, np.zeros(lit.shape, dtype=np.uint8)
+    else:
+        cells = cell_positions(frames.gray, capture.projector)
+        code, unresolved = decode_edges(frames, noise, words, len(cells), limits)
+        position = position_map(frames, noise, code, cells).position
     name = f"{camera}-{axis.value}"
     with storage_errors(folder):
         tifffile.imwrite(folder / f"position-{name}.tiff", position)

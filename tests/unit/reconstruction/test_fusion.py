@@ -22,10 +22,13 @@ from slrig.model import (
     Pattern,
     Refusal,
     Shot,
+    Sine,
     Size,
     White,
 )
 from slrig.patterns.codes import cell_positions, index_of_word
+from slrig.patterns.sequence import phase_patterns
+from slrig.patterns.sine_positions import sine_position_px, sine_turns
 from slrig.reconstruction.camera_response import estimate_noise
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames, axis_frames
@@ -70,6 +73,8 @@ class Plate:
             return np.full(SHAPE, float(isinstance(pattern, White)))
         if isinstance(pattern, LineShift):
             return np.asarray(self.line * (1 + np.cos(2 * np.pi * (x - pattern.centre_px) / PERIOD)))
+        if isinstance(pattern, Sine):
+            return np.asarray(0.5 + 0.5 * np.cos(2 * np.pi * (x / pattern.period_px - pattern.shift / pattern.steps)))
         assert isinstance(pattern, Gray)
         cell = np.floor((x + 0.5) / pattern.cell_px).astype(np.int64)
         lit = (cell ^ cell >> 1) >> (pattern.bits - 1 - pattern.bit) & 1
@@ -86,9 +91,11 @@ class Plate:
             value = value + np.sqrt(self.read_variance + self.slope * value) * rng.standard_normal(SHAPE)
         return np.clip(np.rint(value), 0, 255).astype(np.uint8)
 
-    def capture(self, exposures_s: Sequence[float] = EXPOSURES_S, *, seed: int | None = None) -> Capture:
+    def capture(
+        self, exposures_s: Sequence[float] = EXPOSURES_S, *, seed: int | None = None, shown: Sequence[Pattern] = ()
+    ) -> Capture:
         rng = None if seed is None else np.random.default_rng(seed)
-        shown = patterns()
+        shown = shown or patterns()
         shots = tuple(
             Shot(i, "eye", self.image(pattern, exposure_s, rng), exposure_s)
             for exposure_s in exposures_s
@@ -294,3 +301,13 @@ def test_a_bracket_without_inverses_is_fused_as_well() -> None:
     fusion = fuse_exposures(unpaired(PLATE.capture(seed=4)), "eye", COLUMN)
     assert fusion.frames.inverses is None
     assert np.mean(decoded(fusion.frames, fusion.noise) == Refusal.NONE) > 0.95
+
+
+def test_a_bracket_of_sinusoids_is_fused_as_well() -> None:
+    shown = phase_patterns(PROJECTOR, period_px=PERIOD, steps=4, rows=False)
+    frames = fuse_exposures(PLATE.capture(seed=5, shown=shown), "eye", COLUMN).frames
+    by_period = np.reshape(frames.sinusoids, (3, 4, *SHAPE))
+    periods_px = [each.period_px for each in frames.sine_patterns[::4]]
+    found = sine_position_px([sine_turns(each) for each in by_period], periods_px, PROJECTOR.width_px)
+    error_px = found.position_px - PLATE.column_px
+    assert np.sqrt(np.mean(error_px**2)) < 0.05

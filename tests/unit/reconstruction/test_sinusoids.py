@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,12 +11,28 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from slrig.errors import PatternError
-from slrig.model import Axis, FloatArray, Gray, NoiseModel, Refusal, Sine, Size, sine_groups
-from slrig.patterns import require_numbered
+from slrig.model import (
+    Axis,
+    Black,
+    FloatArray,
+    Gray,
+    NoiseModel,
+    Pattern,
+    Refusal,
+    Sine,
+    Size,
+    White,
+    sine_groups,
+)
+from slrig.patterns import cell_positions, index_of_word, level_lines, line_positions, require_numbered
+from slrig.reconstruction.decoded_image import CodeTables, ReconstructionLimits
 from slrig.reconstruction.decoding import CodeMap
-from slrig.reconstruction.frames import AxisFrames, axis_patterns
-from slrig.reconstruction.sinusoids import SinusoidMap, locate_sinusoids, mean_light
-from tests.unit.reconstruction.builders import grid, rms
+from slrig.reconstruction.frames import AxisFrames, axis_frames, axis_patterns
+from slrig.reconstruction.fusion import fuse_exposures
+from slrig.reconstruction.pipeline import camera_curves
+from slrig.reconstruction.second_axis import decode_second_axis
+from slrig.reconstruction.sinusoids import SinusoidMap, decode_sinusoids, locate_sinusoids, mean_light
+from tests.unit.reconstruction.builders import grid, rms, seen_by_camera
 
 PROJECTOR_PX = 1024
 NOISE = NoiseModel(1.0, 0.02)
@@ -176,3 +193,67 @@ def test_mean_light_is_that_of_the_power_of_a_sinusoid(gamma: float) -> None:
     of_phase = (0.5 + 0.5 * np.cos(phase)) ** gamma
     expected = of_phase.mean(), 2 * (of_phase * np.cos(phase)).mean()
     assert mean_light(gamma) == pytest.approx(expected, abs=1e-5)
+
+
+CODE = tuple(Gray(Axis.COLUMN, bit, 3, 16, 0, inverted) for bit in range(3) for inverted in (False, True))
+ENDS = (White(), Black())
+
+
+@pytest.mark.parametrize(
+    "patterns",
+    [(*ENDS, *CODE, *FOUR_STEPS), (*CODE, *FOUR_STEPS), played((16.0, 4), (128 / 7, 4)),
+     (*ENDS, *played((16.0, 3), (128.0, 3)))],
+    ids=["white, black, Gray", "Gray", "two periods", "2x3 with white and black"],
+)  # fmt: skip
+def test_curves_of_sinusoids_lie_at_their_projector_positions(patterns: tuple[Pattern, ...]) -> None:
+    x, y = grid((90, 200))
+    position_px = 10 + 0.5 * x + 0.03 * y
+    capture = seen_by_camera(position_px, patterns, Size(128, 96))
+    frames = axis_frames(capture, "eye", Axis.COLUMN)
+    stages: list[str] = []
+    curves = camera_curves(frames, tables_of(frames, 128), ReconstructionLimits(), report_step=stages.append)
+    ensemble = curves.ensemble
+    assert len(ensemble.position_px) > 90
+    seen_px = 10 + 0.5 * ensemble.points_px[:, 0] + 0.03 * ensemble.points_px[:, 1]
+    error_px = seen_px - np.repeat(ensemble.position_px, np.diff(ensemble.offsets))
+    assert len(error_px) > 0.9 * 90 * 90
+    assert np.abs(error_px).max() < 0.5
+    assert abs(error_px.mean()) < 0.02
+    # In camera pixels, each half a projector pixel.
+    assert 0.7 <= np.quantile(np.abs(error_px / 0.5 / ensemble.sigma_px), 0.6827) <= 1.25
+
+
+def tables_of(frames: AxisFrames, extent_px: int) -> CodeTables:
+    """Tables of positions and levels."""
+    size, positions = Size(extent_px, 96), Gray(Axis.COLUMN, 0, 7)
+    levels = line_positions(level_lines(frames.sine_patterns), positions, size)
+    return CodeTables(index_of_word(frames.gray), cell_positions(positions, size), levels)
+
+
+def test_a_second_axis_of_sinusoids_has_their_positions() -> None:
+    x, y = grid((60, 80))
+    position_px = 20 + 0.6 * x + 0.1 * y
+    frames = axis_frames(seen_by_camera(position_px, (*ENDS, *CODE, *FOUR_STEPS), Size(128, 96)), "eye", Axis.COLUMN)
+    second = decode_second_axis(frames, NoiseModel(0.8, 0.0), tables_of(frames, 128), ReconstructionLimits().decoding)
+    error_px = second.positions.position_px - position_px
+    assert np.isfinite(error_px).mean() > 0.99
+    assert rms(error_px[np.isfinite(error_px)]) < 0.1
+
+
+def test_a_bracket_of_sinusoids_measures_what_its_longest_exposure_clips() -> None:
+    x, y = grid((60, 120))
+    position_px = 10 + 0.8 * x + 0.03 * y
+    long, short = (
+        seen_by_camera(position_px, played((16.0, 4), (128 / 7, 4)), Size(128, 96), white=white)
+        for white in (320.0, 80.0)
+    )
+    shots = [replace(each, exposure_s=0.04) for each in long.shots]
+    shots += [replace(each, exposure_s=0.01) for each in short.shots]
+    clipped = np.max([each.image for each in long.shots], axis=0) == 255
+    fused = fuse_exposures(replace(long, shots=tuple(shots)), "eye", Axis.COLUMN)
+    limits = ReconstructionLimits().decoding
+    found = decode_sinusoids(fused.frames, fused.noise, np.zeros(2, np.int32), 128, limits)
+    error_px = (found.measured.position - position_px)[:, 5:-5]
+    assert clipped.mean() > 0.2
+    assert np.isfinite(error_px[clipped[:, 5:-5]]).mean() > 0.95
+    assert rms(error_px[np.isfinite(error_px)]) < 0.15
