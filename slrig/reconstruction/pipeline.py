@@ -9,6 +9,8 @@ The steps, in order, by the names under which they are reported:
 5. identify stripes: chain points and look up their projector position (`stripes`, `identification`);
 6. link stripes: join the stripes of each position into one curve (`identification`).
 
+With sinusoids, step 2 gives the position at each pixel (`sinusoids`), and step 4 all points, on its levels.
+
 `CameraStream` runs them as frames arrive, `camera_curves` on frames that are all there. The curves of all cameras are
 then triangulated (`triangulation`), merged (`merging`) and given standard deviations (`uncertainty`).
 """
