@@ -83,7 +83,7 @@ def test_the_patterns_of_a_program_light_what_slrig_says(program: str) -> None:
 def test_opencv_itself_shows_these_patterns(size: Size) -> None:
     if not hasattr(cv2, "structured_light"):
         pytest.skip("needs OpenCV's extra modules: pip install opencv-contrib-python-headless")
-    from slrig.importers.captures import ProjectorCode, opencv_sequence
+    from slrig.importers.orders import ProjectorCode, opencv_sequence
 
     made, images = cv2.structured_light.GrayCodePattern.create(size.width_px, size.height_px).generate()
     assert made
