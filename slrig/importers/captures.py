@@ -7,7 +7,7 @@ import io
 import re
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -115,6 +115,11 @@ def import_capture(
             raise BundleError(message)
         images.cameras = dict(zip(names, images.cameras.values(), strict=True))
     formats = {name: _common_format(files, bit_depth) for name, files in images.cameras.items()}
+    is_depth_known = bit_depth is not None
+    if images.understood is not None and not is_depth_known:
+        is_depth_known = True
+        found = images.understood.sample_bits()
+        formats = {name: replace(form, bit_depth=found.get(name, form.bit_depth)) for name, form in formats.items()}
     sizes = {name: each.size for name, each in formats.items()}
     default_file = next((folder / each for each in CALIBRATIONS if (folder / each).is_file()), None)
     path, calibration = calibration_file or default_file, None
@@ -125,9 +130,7 @@ def import_capture(
     patterns = list(dict.fromkeys(pattern for files in images.cameras.values() for _, pattern in files))
     with BundleWriter(output, code.size, patterns, formats, calibration) as writer:
         for name, files in images.cameras.items():
-            images.faults += _write_camera(
-                writer, name, files, formats[name], patterns, is_depth_given=bit_depth is not None
-            )
+            images.faults += _write_camera(writer, name, files, formats[name], patterns, is_depth_given=is_depth_known)
     return path
 
 
@@ -154,16 +157,16 @@ def _assign_by_looks(folder: Path, code: ProjectorCode) -> ImageAssignment:
         found = understand_folder(groups, code.size, cell_px=code.stated_cell_px, offset_px=code.stated_offset_px)
     except BundleError as cause:
         raise BundleError(f"{folder}: {cause}") from cause
-    if known is not None and _differing(known, found) <= _MAX_EXPLAINED:
+    if known is not None and _fits(known, found):
         return known
     return ImageAssignment(found.assigned, [each.path.name for each in found.alone], understood=found)
 
 
-def _differing(known: ImageAssignment, found: UnderstoodFolder) -> int:
-    """Number of images whose pattern is another one than a known order says; of those that are all there."""
+def _fits(known: ImageAssignment, found: UnderstoodFolder) -> bool:
+    """True if images show what a known order says, but for some that show the pattern of another image."""
     shown = {path: pattern for files in found.assigned.values() for path, pattern in files}
-    both = [(shown.get(path), pattern) for files in known.cameras.values() for path, pattern in files]
-    return sum(one != other for one, other in both)
+    differing = {path for files in known.cameras.values() for path, pattern in files if shown.get(path) != pattern}
+    return differing <= found.faults and len(differing) <= _MAX_EXPLAINED
 
 
 def _assign_by_order(

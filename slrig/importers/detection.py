@@ -26,7 +26,7 @@ _SAMPLES = 60_000  # of an image
 _MIN_LIT = 300
 _MIN_RANGE_SIGMAS = 12.0, 6.0
 _MIN_STRONG = 0.6  # of the samples with the lower of these ranges, that have the higher one
-_MIN_RANGE = 0.12  # of the 99th percentile of the range
+_MIN_RANGE = 0.4, 0.2, 0.12  # of the 99th percentile of the range: the brightest samples tell exposures first
 _MINORITY = 0.01  # of the lit samples, on the other side of the middle: fewer are a flat image
 _MAX_NOISY, _ALONE = 0.3, 0.55  # share of a minority that may be noise; of its neighbours that are on the other side
 _COMPLEMENT, _COPY = -0.55, 0.96  # correlations
@@ -35,16 +35,18 @@ _MAX_CROSSINGS = 0.42  # of adjacent pixels; stripes with more are not resolved
 _SAME_DENSITY = 0.35  # in octaves, of shifted patterns of one period
 _MIN_EDGES = 12  # pairs of pixels across an edge
 _SURE = 0.5  # mean sign of a bit at the edges of coarser ones
+_TOGETHER = 0.6  # of the edges of coarser bits, at which finer ones change too in a plain binary code
+_TURNED = 0.8  # what a bit counts whose first image is another than those of the others
 _MAX_WEIGHT = 15.0  # root of a number of edges: more are not surer
 _MIN_FACTOR_SHARE = 0.08  # of the lit samples, that tell the light of an image
 _MAX_HIDDEN = 3  # bits that are constant where there is light, or not resolved, at each end of a code
-_MISSING, _EXTRA, _WRONG = 1.3, 1.6, 4.0  # costs of an order of images
+_MISSING, _EXTRA, _WRONG, _EXCHANGED = 1.3, 1.6, 4.0, 1.8  # costs of an order of images
 _MAX_COST = 6.0
 _CLEAR = 0.72  # swing of a bit, after which the next finer one is still resolved
 _MAX_WORSE = 1.2  # cost of an order over that of the best, that is kept
 _BAND = 3  # images that an order may be ahead or behind, beyond those before and after the bits
 RIVAL = 0.25  # of the costs of two readings that count as equally good
-_REFUTED, _BACKWARD, _LEFT_HANDED, _CENTRED = 3.0, 0.3, 2.0, 0.35  # costs of a reading
+_REFUTED, _BACKWARD, _LEFT_HANDED, _CENTRED = 3.0, 0.5, 2.0, 0.35  # costs of a reading
 _OFF_CENTRE = 3.0  # cost of a visible range whose middle is a projector's extent away from its middle
 
 
@@ -86,13 +88,13 @@ def find_light(samples: Sequence[Light], *, trimmed: int = 1) -> Lit | None:
     skipped = min(trimmed if count > 5 else 0, (count - 2) // 2)
     factor, is_measured = np.ones(count), np.zeros(count, np.bool_)
     sigma = _noise(samples)
-    for _ in range(3):
+    for least in _MIN_RANGE:
         even = stack / factor[:, None, None].astype(np.float32)
         ordered = np.partition(even, (skipped, count - 1 - skipped), axis=0)
         low, high = ordered[skipped], ordered[count - 1 - skipped]
         span = high - low
         top = float(np.percentile(span, 99))
-        strong, lit = ((span >= max(each * sigma, _MIN_RANGE * top, 1e-6)).all(axis=0) for each in _MIN_RANGE_SIGMAS)
+        strong, lit = ((span >= max(each * sigma, least * top, 1e-6)).all(axis=0) for each in _MIN_RANGE_SIGMAS)
         # The calmer samples tell more, unless they are a few bright spots.
         lit = strong if np.count_nonzero(strong) > _MIN_STRONG * np.count_nonzero(lit) else lit
         if np.count_nonzero(lit) < _MIN_LIT:
@@ -274,9 +276,9 @@ def find_chain(units: Sequence[Unit], axis: Axis, *, direct_first: bool | None) 
     while (found := max((_fitness(nesting, units, each, backward=backward), each) for each in _moved(order)))[0] > best:
         best, order = found
     levels, polarity, sure = _numbered(nesting, order, direct_first=direct_first)
-    weight = nesting.weight
-    common = float((nesting.shared * weight).sum() / max(weight.sum(), 1e-9))
-    return Chain(axis, tuple(units[k] for k in order), levels, polarity, sure, common > 0.6)
+    common = nesting.shared[np.triu_indices(len(units), 1)]
+    is_binary = len(units) > 3 and float(np.median(common)) > _TOGETHER
+    return Chain(axis, tuple(units[k] for k in order), levels, polarity, sure, is_binary)
 
 
 def _moved(order: list[int]) -> Iterator[list[int]]:
@@ -291,32 +293,34 @@ def _nesting(units: Sequence[Unit], plane: int) -> _Nesting:
     count = len(units)
     sign = np.stack([each.swing[[0, plane]] > 0 for each in units])
     edges = sign[:, 0] != sign[:, 1]
-    together = edges.sum(axis=0)
+    # At steps in depth many bits change. Near any edge the finest bits may change too.
+    fine = np.argsort([each.density for each in units])[max(3, count - 2) :]
     found = _Nesting(*np.zeros((3, count, count)))
     for one, other in product(range(count), repeat=2):
-        # At steps in depth many bits change.
-        clean = edges[one] & (together - edges[other] == 1)
+        rest = [k for k in range(count) if k not in (one, other) and k not in fine]
+        clean = edges[one] & ~edges[rest].any(axis=0)
+        found.shared[one, other] = float(edges[other][edges[one]].mean()) if edges[one].any() else 0.0
         if one == other or (number := int(np.count_nonzero(clean))) < _MIN_EDGES:
             continue
         swing = units[other].swing[[0, plane]][:, clean].mean(axis=0) / max(units[other].strength, 1e-6)
         found.mean[one, other] = float(np.clip(swing, -1, 1).mean())
         found.weight[one, other] = math.sqrt(number)
-        found.shared[one, other] = float(edges[other][clean].mean())
     return found
 
 
 def _fitness(nesting: _Nesting, units: Sequence[Unit], order: Sequence[int], *, backward: bool) -> float:
     """Agreement of an order of bits with a Gray code; among equals, that in the order of the sequence fits best.
 
-    All bits are direct, or all inverse, but those whose one image is left of two.
+    The first images of all units are bits, or of all are inverses, but where images are exchanged or missing.
     """
     mean, weight = (each[np.ix_(order, order)] for each in (nesting.mean, nesting.weight))
     expected = np.triu(np.full(mean.shape, -1.0), 1) + 2 * np.eye(len(order), k=1)
     weight = np.minimum(weight, _MAX_WEIGHT) * (expected != 0)
     votes = (weight * expected * mean).sum(axis=0)
-    pairs = sum(len(each.images) == 2 for each in units)
-    single = np.array([len(units[k].images) == 1 and pairs > len(units) / 2 for k in order])
-    agreement = abs(float(votes[~single].sum())) + float(np.abs(votes[single]).sum())
+    usual = math.copysign(1.0, float(votes.sum()))
+    # Where a bit is missing, the next finer one is dark at the edges of the next coarser one too.
+    without = usual * (weight * -np.abs(expected) * mean).sum(axis=0)
+    agreement = float(np.maximum.reduce([usual * votes, _TURNED * np.abs(votes), _TURNED * without]).sum())
     steps = np.sign(np.diff([units[k].place for k in order])) * (-1 if backward else 1)
     bonus = 0.01 * float(np.mean(steps)) if len(steps) else 0.0
     return agreement / max(float(weight.sum()), 1e-9) + bonus
@@ -378,7 +382,7 @@ class CodeBit:
 class Order:
     """An order of bits that explains the images. shows : for each image its bit, "white", "black", or None if it is of
     no use. bits : number of bits of each axis. cost : how badly it explains them. turned : number of images that were
-    moved from the end to the front. missing : bits without an image.
+    moved from the end to the front. missing : bits without an image. exchanged : images in another's place.
     """
 
     shows: tuple[CodeBit | str | None, ...]
@@ -386,6 +390,7 @@ class Order:
     cost: float
     turned: int = 0
     missing: tuple[CodeBit, ...] = ()
+    exchanged: tuple[int, ...] = ()
 
     @property
     def absent(self) -> tuple[CodeBit, ...]:
@@ -408,30 +413,33 @@ def find_orders(
     *,
     direct_first: bool,
     pairs: bool,
+    turns: Sequence[int],
 ) -> list[Order]:
     """Return the orders of a code that explain the images, best first.
 
     resolved : levels of each axis' chain; full : bits that the projector needs with cells of one pixel; finest :
-    swing of the finest bit that is resolved, after which a bit may be that is not.
+    swing of the finest bit that is resolved, after which a bit may be that is not; turns : numbers of images that are
+    moved from the end to the front.
     """
     found: list[Order] = []
-    for turned in (0, 1, -1, 2, -2):
+    for turned in turns:
         moved = [images[(place - turned) % len(images)] for place in range(len(images))]
         templates = _templates(moved, resolved, full, finest, direct_first=direct_first, pairs=pairs)
         for template, bits, prior in sorted(templates, key=lambda each: each[2]):
             if found and prior > found[0].cost + _MAX_WORSE:
                 break
-            cost, shows, missing = _align(moved, template, limit=found[0].cost + _MAX_WORSE if found else math.inf)
+            cost, shows, missing, exchanged = _align(
+                moved, template, limit=min(_MAX_COST, found[0].cost + _MAX_WORSE if found else _MAX_COST)
+            )
             if not math.isfinite(cost):
                 continue
             back = tuple(shows[(place + turned) % len(images)] for place in range(len(images)))
             # White without black, or black without white, is rarer than both or neither.
             lone = 0.25 * (("white" in back) != ("black" in back))
-            found.append(Order(back, bits, cost + prior + lone + 0.9 * abs(turned), turned, missing))
+            strays = tuple((place - turned) % len(images) for place in exchanged)
+            found.append(Order(back, bits, cost + prior + lone + 0.9 * abs(turned), turned, missing, strays))
             found += _other_halves(found[-1], images)
             found.sort(key=lambda each: each.cost)
-        if found and found[0].cost < 1.0:
-            break
     return found
 
 
@@ -554,15 +562,14 @@ def _mismatch(image: _Image, bit: CodeBit, place: float, resolved: dict[Axis, se
     if is_coarse or is_fine or image.axis is not bit.axis:
         return _WRONG
     apart = abs(image.bit - place)
-    if apart > 1 or (apart == 1 and not image.is_close):
-        return _WRONG
-    return 0.5 * apart + 2.5 * turned
+    return (0.5 if apart == 1 and image.is_close else _EXCHANGED if apart else 0.0) + _EXCHANGED / 2 * turned
 
 
 def _align(
     images: Sequence[_Image], template: Sequence[tuple[CodeBit, float]], *, limit: float
-) -> tuple[float, tuple[CodeBit | str | None, ...], tuple[CodeBit, ...]]:
-    """Return the least cost of aligning images with bits, what each image then shows, and the bits without an image.
+) -> tuple[float, tuple[CodeBit | str | None, ...], tuple[CodeBit, ...], tuple[int, ...]]:
+    """Return the least cost of aligning images with bits, what each image then shows, the bits without an image, and
+    the images in another's place.
 
     Flat images before and after the bits are white and black; others that fit no bit are left out. Cost of an order by
     dynamic programming, as of an edit distance; infinite above `limit`.
@@ -577,7 +584,6 @@ def _align(
     step = [[""] * (length + 1) for _ in range(count + 1)]
     cost[0][0] = 0.0
     spare = count - length
-    limit = min(limit, _MAX_COST)
     for i in range(count + 1):
         for j in range(max(0, i - max(spare, 0) - _BAND), min(length, i - min(spare, 0) + _BAND) + 1):
             best, how = cost[i][j], step[i][j]
@@ -591,17 +597,19 @@ def _align(
                     best, how = value, "shown"
             cost[i][j], step[i][j] = best, how
         if min(cost[i]) > limit:
-            return math.inf, (), ()
+            return math.inf, (), (), ()
     if cost[count][length] > limit:
-        return math.inf, (), ()
+        return math.inf, (), (), ()
     shows: list[CodeBit | str | None] = [None] * count
-    missing = []
+    missing: list[CodeBit] = []
+    exchanged: list[int] = []
     i, j = count, length
     while i or j:
         how = step[i][j]
         if how == "shown":
             i, j = i - 1, j - 1
-            shows[i] = template[j][0]
+            shows[i] = _shown(images[i], template[j], template)
+            exchanged += [i] if shows[i] != template[j][0] else []
         elif how == "missing":
             j -= 1
             missing.append(template[j][0])
@@ -610,7 +618,17 @@ def _align(
             level = images[i].level
             if math.isfinite(level) and j in (0, length):
                 shows[i] = "white" if level > 0.35 else "black"
-    return cost[count][length], tuple(shows), tuple(reversed(missing))
+    return cost[count][length], tuple(shows), tuple(reversed(missing)), tuple(reversed(exchanged))
+
+
+def _shown(image: _Image, expected: tuple[CodeBit, float], template: Sequence[tuple[CodeBit, float]]) -> CodeBit:
+    """Return the bit that an image shows: what it is by itself counts more than its place in the order."""
+    bit, place = expected
+    if image.bit < 0 or image.is_close:
+        return bit
+    own = next((each for each, at in template if each.axis is image.axis and at == image.bit), bit)
+    inverted = image.polarity < 0 if image.polarity else bit.inverted
+    return replace(own, inverted=inverted) if place != image.bit or inverted != bit.inverted else bit
 
 
 def _spare(image: _Image, *, is_end: bool) -> float:

@@ -17,6 +17,7 @@ from slrig.importers.detection import Light, sample_image
 from slrig.importers.orders import pattern_words
 from slrig.importers.understanding import Understanding, understand
 from slrig.model import CameraFormat, Pattern, Pixels, Size
+from slrig.reconstruction import sample_format
 
 IMAGES = {".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"}
 
@@ -31,12 +32,13 @@ Groups = dict[str, list[Path]]
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A small grey picture of an image, for people. form : of the image."""
+    """An image, as far as it is needed to understand it. thumbnail : for people; brightest : sample of the image."""
 
     path: Path
     thumbnail: Pixels
     samples: Light
     form: CameraFormat
+    brightest: int
 
 
 @dataclass(slots=True)
@@ -55,6 +57,15 @@ class UnderstoodFolder:
         return list(dict.fromkeys(found))
 
     @property
+    def faults(self) -> set[Path]:
+        """Images that do not show what their place says: copies, and exchanged ones."""
+        return {
+            pictures[image].path
+            for pictures, each in self.cameras.values() for doubt in each.doubts if doubt.is_fault
+            for image in doubt.images
+        }  # fmt: skip
+
+    @property
     def facts(self) -> list[str]:
         """What was found, in words."""
         found = []
@@ -63,6 +74,17 @@ class UnderstoodFolder:
             found += [f"  {fact}" for fact in each.facts]
         if self.alone:
             found.append(f"beside the set, left out: {', '.join(each.path.name for each in self.alone)}")
+        return found
+
+    def sample_bits(self) -> dict[str, int]:
+        """Bits of a sample of each camera with 16-bit images that uses only the lower ones."""
+        found = {}
+        for name, (pictures, _) in self.cameras.items():
+            if pictures[0].form.bit_depth > 8:
+                samples = [each.samples.astype(np.uint16) for each in pictures]
+                _, full_scale = sample_format([each.reshape(-1, each.shape[-1]) for each in samples], 65535.0)
+                # Samples in the upper bits of a word stay as they are: reconstruction finds their step.
+                found[name] = max(int(full_scale), *(each.brightest for each in pictures)).bit_length()
         return found
 
     @property
@@ -139,7 +161,7 @@ def read_picture(path: Path) -> Picture:
     image = read_with_colour(path, (0,), form)[0][0]
     scale = _THUMBNAIL_PX / max(image.shape)
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return Picture(path, small, sample_image(image), form)
+    return Picture(path, small, sample_image(image), form, int(image.max()))
 
 
 def understand_folder(

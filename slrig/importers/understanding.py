@@ -35,6 +35,7 @@ from slrig.patterns import gray_bits
 Names = Callable[[int], str]
 
 _MAX_READ = 6  # orders whose codes are placed on the projector
+_PLAUSIBLE = 1.6  # cost of a reading, above which images may have been turned
 _MIN_SURENESS = 0.45
 _MAX_DISORDER = 2.2
 _UNEVEN_LIGHT = 0.12
@@ -44,10 +45,13 @@ _MAX_NAMED = 4
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """Something in a folder that is unusual, and the images that it concerns."""
+    """Something in a folder that is unusual, and the images that it concerns. is_fault : True for images that do not
+    show what their place says.
+    """
 
     text: str
     images: tuple[int, ...] = ()
+    is_fault: bool = False
 
 
 @dataclass(slots=True)
@@ -92,11 +96,17 @@ def understand(
     chains, direct_first, pairs = _chains(code)
     if not chains:
         raise BundleError(_nothing_found(looks, len(samples)))
+    for axis, chain in chains.items():
+        if chain.is_binary:
+            raise BundleError(
+                f"the code of {axis}s is plain binary: several bits change at one edge; slrig reads Gray codes, whose "
+                "edges tell positions between pixels; record a Gray code"
+            )
     readings = _read(
         lit, code, chains, projector, leave=shifted, direct_first=direct_first, pairs=pairs, hints=(cell_px, offset_px)
     )
     for group in groups:
-        lines = _lines(lit, group, readings[0], chains, projector, width)
+        lines = _lines(lit, group, looks, readings[0], chains, projector, width)
         if lines is not None and lines.is_reversed:
             readings = _forward(readings, lines.axis)
     reading = readings[0]
@@ -105,8 +115,8 @@ def understand(
     for index, shown in enumerate(reading.order.shows):
         found.patterns[index] = _pattern(shown, reading.places)
     for group in groups:
-        lines = _lines(lit, group, reading, chains, projector, width)
-        images = sorted(image for unit in group for image in unit.images)
+        lines = _lines(lit, group, looks, reading, chains, projector, width)
+        images = _line_images(group, looks)
         if lines is None:
             text = "change as often as each other, as shifted lines or sinusoids do, but fit no period of the code"
             found.doubts.append(Doubt(f"{_listed(images, name)} {text}: left out", tuple(images)))
@@ -152,16 +162,29 @@ def _read(
     resolved = {axis: chain.levels[-1] + 1 for axis, chain in chains.items()}
     extents = {axis: projector.along(axis) for axis in chains}
     finest = {axis: chain.units[-1].strength for axis, chain in chains.items()}
-    orders = find_orders(
-        [images[place] for place in places], resolved, full, finest, direct_first=direct_first, pairs=pairs
-    )
-    readings = []
-    for order in orders[:_MAX_READ]:
-        shows: list[CodeBit | str | None] = [None] * len(lit.light)
-        for place, shown in zip(places, order.shows, strict=True):
-            shows[place] = shown
-        whole = Order(tuple(shows), order.bits, order.cost, order.turned, order.missing)
-        readings += place_codes(lit, whole, extents, cell_px=hints[0], offset_px=hints[1])[:4]
+    orders: list[Order] = []
+    readings: list[Reading] = []
+    for turns in ((0,), (1, -1, 2, -2)):
+        orders += find_orders(
+            [images[place] for place in places],
+            resolved,
+            full,
+            finest,
+            direct_first=direct_first,
+            pairs=pairs,
+            turns=turns,
+        )
+        orders.sort(key=lambda each: each.cost)
+        readings.clear()
+        for order in orders[:_MAX_READ]:
+            shows: list[CodeBit | str | None] = [None] * len(lit.light)
+            for place, shown in zip(places, order.shows, strict=True):
+                shows[place] = shown
+            exchanged = tuple(places[each] for each in order.exchanged)
+            whole = replace(order, shows=tuple(shows), exchanged=exchanged)
+            readings += place_codes(lit, whole, extents, cell_px=hints[0], offset_px=hints[1])[:4]
+        if any(each.cost < _PLAUSIBLE for each in readings):
+            break
     readings.sort(key=lambda each: each.cost)
     lacking = orders[0].absent if orders else ()
     if lacking and (not readings or readings[0].order.cost > orders[0].cost + RIVAL):
@@ -202,8 +225,20 @@ def _pattern(shown: CodeBit | str | None, places: Mapping[Axis, CodePlace]) -> P
     return None
 
 
+def _line_images(group: Sequence[Unit], looks: Looks) -> list[int]:
+    """Images of a group of shifted patterns; one of them may show the same as a bit of the code."""
+    own = [image for unit in group for image in unit.images]
+    return sorted([*own, *(copy for copy in looks.copies if min(own) - 1 <= copy <= max(own) + 1)])
+
+
 def _lines(
-    lit: Lit, group: Sequence[Unit], reading: Reading, chains: Mapping[Axis, Chain], projector: Size, width: int
+    lit: Lit,
+    group: Sequence[Unit],
+    looks: Looks,
+    reading: Reading,
+    chains: Mapping[Axis, Chain],
+    projector: Size,
+    width: int,
 ) -> ShiftedLines | None:
     axis = group[0].axis
     if axis is None or axis not in reading.places:
@@ -217,7 +252,7 @@ def _lines(
     if place.mirrored:
         cells = (1 << place.bits >> unresolved) - 1 - cells
     position = position_map(lit, cells, sure, width) * (place.cell_px << unresolved) - 0.5 - place.offset_px
-    images = sorted(image for unit in group for image in unit.images)
+    images = _line_images(group, looks)
     return find_lines(lit, images, axis, position, projector.along(axis))
 
 
@@ -292,7 +327,9 @@ def _doubt(
 ) -> None:
     doubts, order = found.doubts, reading.order
     for copy, original in looks.copies.items():
-        doubts.append(Doubt(f"{name(copy)} is a copy of {name(original)}: left out", (copy,)))
+        if found.patterns[copy] is not None:
+            continue
+        doubts.append(Doubt(f"{name(copy)} is a copy of {name(original)}: left out", (copy,), is_fault=True))
         found.left_out[copy] = "a copy"
     if order.turned:
         count = abs(order.turned)
@@ -307,6 +344,9 @@ def _doubt(
     if order.missing:
         bits = ", ".join(f"{each.axis} bit {each.bit}{' inverse' if each.inverted else ''}" for each in order.missing)
         doubts.append(Doubt(f"no image shows {bits}: a frame is missing"))
+    if order.exchanged:
+        text = f"{_listed(order.exchanged, name)} are in the places of other images: taken for what they show"
+        doubts.append(Doubt(text, order.exchanged, is_fault=True))
     for axis, place in reading.places.items():
         signed = -reading.directions[axis] if place.mirrored else reading.directions[axis]
         if place.mirrored:
@@ -327,11 +367,6 @@ def _doubt(
                 f"{place.bits} bits with cells of 1 px would end at {axis} {reach - 1}, the projector has "
                 f"{projector.along(axis)}: taken as cells of {place.cell_px} px; if they are others, state --cell-px"
             ))  # fmt: skip
-        if chains[axis].is_binary:
-            raise BundleError(
-                f"the code of {axis}s is plain binary: several bits change at one edge; slrig reads Gray codes, whose "
-                "edges tell positions between pixels; record a Gray code"
-            )
         if chains[axis].sureness < _MIN_SURENESS or reading.disorder[axis] > _MAX_DISORDER:
             doubts.append(
                 Doubt(f"the bits of {axis}s hardly nest as a Gray code does: too much noise, or another code")

@@ -453,7 +453,11 @@ def test_an_extent_is_two_numbers(words: str) -> None:
 )
 def test_a_list_that_is_wrong_is_refused(tmp_path: Path, lines: str, said: str) -> None:
     (tmp_path / "list.csv").write_text(lines)
-    with pytest.raises(BundleError) as caught:
+
+    def read() -> None:
         images = assign_images(tmp_path, CODE, ImageNaming(listed=tmp_path / "list.csv"))
         import_capture(tmp_path, tmp_path / "bundle", CODE, images)
+
+    with pytest.raises(BundleError) as caught:
+        read()
     assert said in str(caught.value)
