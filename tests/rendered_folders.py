@@ -20,6 +20,9 @@ from simulated_rig.light import Float32Array
 from simulated_rig.options import HeadOptions
 from simulated_rig.rendering import CameraView, SceneState
 from simulated_rig.scene import build_surface, read_scene
+from slrig.errors import SlrigError
+from slrig.importers import ImageNaming, ProjectorCode, assign_images
+from slrig.importers.captures import ImageAssignment
 from slrig.model import Axis, Black, Gray, LineShift, Pattern, Pixels, Size, White
 from tests.light_bound import ExposedView
 
@@ -117,8 +120,8 @@ def pattern_light(pattern: Pattern, size: Size) -> Pixels:
 
 @dataclass(slots=True)
 class Folder:
-    """A folder of images. shown : what each file shows, None for those that do not belong. kinds : what is unusual, in
-    words. broken : a capture that lacks what it needs, so that it cannot be understood rightly as a whole.
+    """A folder of images. shown : what each file shows, None for those that do not belong. kinds : how it was made, in
+    words.
     """
 
     path: Path
@@ -285,3 +288,39 @@ def _names(chance: random.Random, count: int, kinds: list[str]) -> list[str]:
             return [f"left/{number:02}.png" for number in numbers]
         case _:
             return [f"Image{number}.png" for number in numbers]
+
+
+def judge(folder: Folder, understood: ImageAssignment | SlrigError) -> str:
+    """`right`, `wrong` or `wrong in silence`; `refused`, or `named` where a bit has no image, which is said."""
+    if isinstance(understood, SlrigError):
+        lacks_bit = "missing" in folder.kinds and "plain" in folder.kinds
+        return "named" if lacks_bit and "no image shows" in str(understood) else "refused"
+    found = {
+        path.relative_to(folder.path).as_posix(): pattern
+        for files in understood.cameras.values()
+        for path, pattern in files
+    }
+    shown = list(folder.shown.values())
+    for name, pattern in folder.shown.items():
+        taken = found.get(name)
+        is_copy = taken is None and pattern is not None and shown.count(pattern) > 1
+        if is_copy or (pattern is None and taken is None):
+            continue
+        if pattern is None or taken is None:
+            break
+        one, other = pattern_light(pattern, folder.projector), pattern_light(taken, folder.projector)
+        if not np.array_equal(one, other):
+            break
+    else:
+        return "right"
+    return "wrong" if understood.understood is not None and understood.understood.doubts else "wrong in silence"
+
+
+def understand_folder_of(seed: int, path: Path) -> tuple[Folder, str]:
+    """Write a folder by chance and judge what the importer makes of it without an option."""
+    folder = make_folder(seed, path)
+    try:
+        understood: ImageAssignment | SlrigError = assign_images(path, ProjectorCode(folder.projector), ImageNaming())
+    except SlrigError as cause:
+        understood = cause
+    return folder, judge(folder, understood)

@@ -29,7 +29,7 @@ _LINE = re.compile(r"(\w+) line (\d{1,4}) of (\d{1,4})(?: width (\d{1,4}))?")
 _SINE = re.compile(r"(\w+) sine (\d{1,3}) of (\d{1,3}) period (\d{1,5}(?:\.\d{1,6})?)")
 _FIELDS = {
     "camera": r"[A-Za-z0-9_-]+?",
-    "number": r"\d+",
+    "number": r"(?<!\d)\d+(?!\d)",
     "axis": r"[A-Za-z]+",
     "bit": r"\d+",
     "power": r"\d+",
@@ -185,7 +185,7 @@ def compile_name_template(template: str) -> re.Pattern[str]:
 
 
 def _literal(text: str) -> str:
-    return ".*?".join(map(re.escape, text.split("*")))
+    return ".*".join(map(re.escape, text.split("*")))
 
 
 def pattern_from_name(code: ProjectorCode, match: re.Match[str]) -> Pattern:

@@ -25,6 +25,7 @@ from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
 from tests.e2e.conftest import write_rig
 from tests.golden.test_bundles import reconstructed
+from tests.rendered_folders import understand_folder_of
 from tests.unit.command import slrig
 
 PROJECTOR = Size(200, 160)
@@ -396,3 +397,40 @@ def test_images_that_contradict_are_named_at_import(shared: Path, tmp_path: Path
     assert words in " ".join(result.output.split())
     assert ("doubtful" in result.output) is (kind in ("copy", "exchanged"))
     assert (result.exit_code, (tmp_path / "bundle").exists()) == ((2, False) if "ahead" in words else (0, True))
+
+
+# ---- folders that tell by themselves what they show
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 4, 8, 10, 18, 29, 37])
+def test_a_rendered_folder_is_understood_without_an_option(seed: int, tmp_path: Path) -> None:
+    folder, verdict = understand_folder_of(seed, tmp_path / "images")
+    assert verdict in ("right", "named"), folder.kinds
+
+
+def test_what_was_found_is_proposed_and_can_be_read_again(tmp_path: Path) -> None:
+    shown = photographed("opencv")
+    # The camera's name after the number, a time stamp before it, and all images one frame ahead.
+    shown.append(shown.pop(0))
+    folder = tmp_path / "images of a colleague"
+    folder.mkdir()
+    for number, image in enumerate(shown):
+        assert cv2.imwrite(str(folder / f"20240511_{101500 + 7 * number}_{number:02}_left.png"), image)
+    ask = (folder, "--projector", "200x160", "--output", tmp_path / "my bundle")
+    refused = run(*ask)
+    sheet = tmp_path / "my bundle-sheet.png"
+    assert refused.exit_code == 2
+    assert f"Look at {sheet}; if it is right, add --yes" in " ".join(refused.stderr.split())
+    assert cv2.imread(str(sheet)) is not None
+    taken = run(*ask, "--yes", "--save-list", tmp_path / "list.csv")
+    assert taken.exit_code == 0, taken.output
+    assert f"slrig reconstruct '{tmp_path / 'my bundle'}' --output 'my bundle-mesh'" in taken.output
+    again = imported(folder, tmp_path / "again", "--list", tmp_path / "list.csv")
+    one, other = read_bundle(tmp_path / "my bundle").capture, read_bundle(again).capture
+    assert set(one.patterns) == set(OWN["opencv"])
+    assert one.patterns == other.patterns
+    numbered = run(folder, "--projector", "200x160", "--output", tmp_path / "b", "--names", "*_{number}_{camera}.png")
+    assert "camera left: 34 images" in numbered.output
+    listed = run(folder, "--projector", "200x160", "--output", tmp_path / "c", "--format", "opencv")
+    assert "34 cameras of one image each" in " ".join(listed.stderr.split())
