@@ -11,8 +11,8 @@ from slrig.discovery import open_rig
 from slrig.model import Axis, Black, Gray, Pattern, Sine, White
 from slrig.patterns import encode
 from slrig.scan import acquisition
-from slrig.scan.plan import ReconstructionPlan, ScanPlan
-from slrig.scan.reconstruct import reconstruct_bundle
+from slrig.scan.plan import ScanPlan
+from tests.golden.test_bundles import reconstructed
 from tests.prepared_bundles import BUNDLES
 
 pytestmark = pytest.mark.slow
@@ -44,10 +44,7 @@ def test_sinusoids_measure_a_rendered_ball(
         acquisition.capture_frames(
             rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False
         ).finish()
-    report = reconstruct_bundle(
-        tmp_path / "bundle", tmp_path / "mesh", plan=ReconstructionPlan(), progress=lambda *_: None,
-        cancelled=lambda: False,
-    )  # fmt: skip
+    report = reconstructed(tmp_path / "bundle", tmp_path / "mesh")
     assert report["method"] == method
     assert any("to the power of 1." in str(note) for note in report["notes"])
     truth = report["truth"]
