@@ -36,6 +36,7 @@ from slrig.reconstruction.frames import (
     linearise,
     mean_image,
     reference_repeats,
+    sample_format,
     used_frames,
     used_shots,
 )
@@ -153,6 +154,7 @@ __all__ = [
     "projector_positions",
     "reference_repeats",
     "refine_pose",
+    "sample_format",
     "sampling_mm",
     "select_points",
     "sheet_coordinates",
