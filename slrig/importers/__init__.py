@@ -2,12 +2,15 @@
 
 from slrig.importers.calibrations import read_any_calibration, write_any_calibration
 from slrig.importers.captures import ImageNaming, ProjectorCode, import_capture, parse_size
+from slrig.importers.exports import lost_in_format, write_template
 
 __all__ = [
     "ImageNaming",
     "ProjectorCode",
     "import_capture",
+    "lost_in_format",
     "parse_size",
     "read_any_calibration",
     "write_any_calibration",
+    "write_template",
 ]

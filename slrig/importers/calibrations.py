@@ -202,7 +202,10 @@ def read_ros(folder: Path) -> Calibration:
             f"{TRANSFORMS} with their poses, found {found}; add the missing files"
         )
     poses = _read_ros_poses(folder / TRANSFORMS)
-    devices = {name: _read_ros_device(path, poses, name) for name, path in files.items()}
+    # Devices have the order of their transforms: the first camera is the reference.
+    frames = [frame.removesuffix(FRAME) for frame in poses]
+    names = sorted(files, key=lambda name: frames.index(name) if name in frames else len(frames))
+    devices = {name: _read_ros_device(files[name], poses, name) for name in names}
     projector = devices.pop(PROJECTOR, None)
     if not devices:
         raise CalibrationError(f"{folder}: expected a camera, found the projector alone; add its NAME.yaml")
