@@ -13,6 +13,7 @@ from typing import NoReturn
 import numpy as np
 
 from slrig.bundle import (
+    DESCRIPTION,
     MAX_CAMERA_PX,
     BundleWriter,
     check_calibration,
@@ -24,7 +25,7 @@ from slrig.disk import storage_errors
 from slrig.errors import BundleError, PatternError
 from slrig.importers.calibrations import centring_offset_px, read_any_calibration
 from slrig.importers.images import (
-    IMAGES,
+    ENDINGS,
     SourceImage,
     find_bit_depth,
     list_images,
@@ -371,7 +372,12 @@ def _group_by_camera(folder: Path, notes: list[str]) -> dict[str, list[SourceIma
             if images:
                 by_folder[each.name] = images
         if not by_folder:
-            raise BundleError(f"{folder}: expected images ({', '.join(sorted(IMAGES))}), found none in it or below it")
+            if (folder / DESCRIPTION).is_file():
+                raise BundleError(
+                    f"{folder}: expected images to import, found a scan bundle; slrig reconstruct reads it"
+                )
+            endings = ", ".join(sorted(ENDINGS))
+            raise BundleError(f"{folder}: expected images ({endings}), found none in it or below it")
         return by_folder
     groups: dict[str, list[SourceImage]] = {}
     for image in images:

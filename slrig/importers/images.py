@@ -19,6 +19,7 @@ from slrig.importers.video import VIDEOS, read_video
 from slrig.model import CameraFormat, Pixels, Size
 
 IMAGES = {".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"}
+ENDINGS = IMAGES | STACKS | VIDEOS
 
 _USUAL_BITS = (10, 12, 14, 16)  # of samples in words of 16
 _SAMPLED_ROWS = 64  # of an image, whose samples tell the step of the values
@@ -89,7 +90,7 @@ def list_images(place: Path) -> tuple[list[SourceImage], list[str]]:
     if place.is_file():
         kind = next((each for each in known if place.suffix.lower() in each), None)
         if kind is None:
-            endings = ", ".join(sorted(set().union(*known)))
+            endings = ", ".join(sorted(ENDINGS))
             raise BundleError(f"{place}: expected a folder of images, or a file of {endings}; save it as one of these")
         files = [place]
     else:

@@ -376,6 +376,8 @@ def test_a_description_that_is_not_text_is_refused(folder: Path) -> None:
 def test_a_folder_without_description_is_refused(tmp_path: Path) -> None:
     _fault(tmp_path, "bundle.json", "found a folder without it")
     _fault(tmp_path / "nowhere", "found no such folder", "give the folder that holds it")
+    (tmp_path / "bundle.zip").touch()
+    _fault(tmp_path / "bundle.zip", "found a file", "unpack it (python3 -m zipfile -e", "give the folder that holds it")
 
 
 def test_a_calibration_of_other_cameras_is_refused(folder: Path) -> None:
