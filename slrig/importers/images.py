@@ -29,16 +29,17 @@ _SAMPLED_ROWS = 64  # of an image, whose samples tell the step of the values
 class SourceImage:
     """One image of a camera, read when it is needed.
 
-    path : file that holds it. name : name of the file, with the page, array or frames after it; stem : the same without
-    ending, with the number last. page : of a TIFF. array : the image, (H, W) or, in BGR, (H, W, 3), of a file that is
-    not an image file. is_stretched : the samples of `array` fill all 16 bits. may_be_idle : it may show what was
-    there before or after the patterns.
+    path : file that holds it. name : name of the file, with the page, array or frame after it; stem : the same without
+    ending, with the number last. page : of a TIFF; form : its format, if it is known. array : (H, W) or, in BGR,
+    (H, W, 3), of a file that is not an image file. is_stretched : the samples of `array` fill all 16 bits.
+    may_be_idle : it may show what was there before or after the patterns.
     """
 
     path: Path
     name: str
     stem: str
     page: int = 0
+    form: CameraFormat | None = None
     array: NDArray[Any] | None = None
     is_stretched: bool = False
     may_be_idle: bool = False
@@ -56,7 +57,7 @@ class SourceImage:
     def read_format(self) -> CameraFormat:
         """Return extent and bits of the samples, 8 or 16. Raises BundleError."""
         if self.array is None:
-            return read_page_formats(self.path)[self.page] if self.page else read_frame_format(self.path)
+            return self.form or read_frame_format(self.path)
         height_px, width_px = self.array.shape[:2]
         return CameraFormat(Size(width_px, height_px), 8 * self.array.dtype.itemsize)
 
@@ -108,7 +109,8 @@ def list_images(place: Path) -> tuple[list[SourceImage], list[str]]:
         notes += [found.summary] if found.summary else []
         for words, array in found.images.items():
             name, stem = f"{file.name} {words}".strip(), f"{file.stem} {words}".strip()
-            images.append(SourceImage(file, name, stem, 0, array, found.is_stretched, words in found.idle))
+            is_idle = words in found.idle
+            images.append(SourceImage(file, name, stem, 0, None, array, found.is_stretched, is_idle))
     return images, notes
 
 
@@ -139,7 +141,7 @@ def _list_pages(path: Path) -> list[SourceImage]:
     pages = [page for page, form in formats.items() if form == formats[0]]
     if len(pages) == 1:
         return [first]
-    return [SourceImage(path, f"{path.name} page {page}", f"{path.stem} {page}", page) for page in pages]
+    return [SourceImage(path, f"{path.name} page {page}", f"{path.stem} {page}", page, formats[0]) for page in pages]
 
 
 def find_bit_depth(images: Iterable[SourceImage], camera: CameraFormat) -> tuple[int, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +18,10 @@ STACKS = {".npy", ".npz"}
 MAX_ARRAY_BYTES = 2**32
 
 _WORD = 65535
-_FAULTS = (OSError, ValueError, EOFError, KeyError, SyntaxError, zipfile.BadZipFile)
+_MIN_SIDE_PX = 16  # of images; smaller arrays are matrices
+_FAULTS = (
+    OSError, ValueError, EOFError, LookupError, SyntaxError, TypeError, RuntimeError, zipfile.BadZipFile, zlib.error
+)  # fmt: skip
 
 
 class ArrayImages(NamedTuple):
@@ -37,7 +41,8 @@ def read_stack(path: Path) -> ArrayImages:
     """Return the images in a file of arrays, by key and number.
 
     An array is an image, (H, W) or (H, W, 3) of red, green and blue, or a stack of such along its first axis, or, grey,
-    along a last one that is the shortest. Raises BundleError: the file is damaged, or an array is not of images.
+    along a last one that is the shortest. Other arrays of an archive are ignored, and named in the summary.
+    Raises BundleError: the file is damaged, or has no images.
     """
     try:
         with path.open("rb") as stream:
@@ -47,16 +52,22 @@ def read_stack(path: Path) -> ArrayImages:
         message = f"{path}: expected arrays of numbers as np.save or np.savez write them, found {cause}; save it again"
         raise BundleError(message) from cause
     images: dict[str, NDArray[Any]] = {}
+    others: list[str] = []
     for key in sorted(arrays, key=lambda each: natural_sort_key(Path(each))):
-        parts = _split(path, key, arrays[key])
-        images |= {
-            f"{key} {number}".strip() if arrays[key].ndim - parts[0].ndim else key: part
-            for number, part in enumerate(parts)
-        }
+        parts = _split(arrays[key])
+        if not parts:
+            others.append(f"{key} {arrays[key].shape} {arrays[key].dtype}".strip())
+            continue
+        several = arrays[key].ndim > parts[0].ndim
+        images |= {f"{key} {number}".strip() if several else key: part for number, part in enumerate(parts)}
     if not images:
-        raise BundleError(f"{path}: expected arrays of images, found none; save them again")
+        raise BundleError(
+            f"{path}: expected arrays of numbers of shape (images, rows, columns), with 3 colours last or without, "
+            f"found {', '.join(others) or 'none'}; save each camera as a file or key of its own"
+        )
     samples, is_stretched = _as_samples(path, list(images.values()))
-    return ArrayImages(dict(zip(images, samples, strict=True)), is_stretched)
+    summary = f"{path.name}: no images, ignored: {', '.join(others)}" if others else ""
+    return ArrayImages(dict(zip(images, samples, strict=True)), is_stretched, summary)
 
 
 def _load_archive(path: Path) -> dict[str, NDArray[Any]]:
@@ -76,8 +87,8 @@ def _load_archive(path: Path) -> dict[str, NDArray[Any]]:
         return {key: arrays[key] for key in arrays.files}
 
 
-def _split(path: Path, key: str, array: NDArray[Any]) -> list[NDArray[Any]]:
-    """Return the images in an array, colours as blue, green and red."""
+def _split(array: NDArray[Any]) -> list[NDArray[Any]]:
+    """Return the images in an array, colours as blue, green and red; none if it is of something else."""
     shape = array.shape
     is_coloured = len(shape) in (3, 4) and shape[-1] == 3 and min(shape[-3:-1]) > 3
     if is_coloured:
@@ -87,12 +98,9 @@ def _split(path: Path, key: str, array: NDArray[Any]) -> list[NDArray[Any]]:
     elif len(shape) == 3 and shape[2] < min(shape[:2]):
         array = np.moveaxis(array, 2, 0)
     dimensions = array.ndim - is_coloured
-    if dimensions not in (2, 3) or array.size == 0 or array.dtype.kind not in "buif":
-        raise BundleError(
-            f"{path}: {key or 'the array'}: expected numbers of shape (images, rows, columns), with 3 colours last or "
-            f"without, found {shape} {array.dtype}; save each camera as a file or key of its own"
-        )
-    return [array] if dimensions == 2 else list(array)
+    images = [array] if dimensions == 2 else list(array) if dimensions == 3 else []
+    is_large = bool(images) and min(images[0].shape[:2]) >= _MIN_SIDE_PX
+    return images if is_large and array.dtype.kind in "buif" else []
 
 
 def _as_samples(path: Path, images: Sequence[NDArray[Any]]) -> tuple[list[NDArray[Any]], bool]:

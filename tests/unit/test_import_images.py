@@ -59,7 +59,12 @@ def columns_first(path: Path, images: Sequence[Pixels]) -> Path:
 
 
 def archive(path: Path, images: Sequence[Pixels]) -> Path:
-    np.savez_compressed(path / "scan.npz", *images)
+    np.savez_compressed(path / "scan.npz", images=np.stack(images), K=np.eye(3), seconds=np.arange(26.0))
+    return path / "scan.npz"
+
+
+def archive_of_images(path: Path, images: Sequence[Pixels]) -> Path:
+    np.savez(path / "scan.npz", *images)
     return path / "scan.npz"
 
 
@@ -92,7 +97,7 @@ def video(path: Path, images: Sequence[Pixels], *, colour: bool = False, bits: i
 
 
 SOURCES = [
-    tiff_stack, pillow_stack, array, columns_first, archive, opaque_png, opaque_by_opencv, video
+    tiff_stack, pillow_stack, array, columns_first, archive, archive_of_images, opaque_png, opaque_by_opencv, video
 ]  # fmt: skip
 
 
@@ -229,9 +234,10 @@ def test_a_file_that_holds_no_images_is_refused(tmp_path: Path, name: str, data:
 
 
 @pytest.mark.parametrize(
-    "values", [np.zeros(5), np.zeros((2, 3, 4, 5, 6)), np.full((4, 5), -1.0), np.full((4, 5), np.nan), np.array(["a"])]
+    "values",
+    [np.zeros(5), np.zeros((2, 3, 4, 5, 6)), np.full((40, 50), -1.0), np.full((40, 50), np.nan), np.array(["a"])],
 )
 def test_an_array_that_is_not_of_images_is_refused(tmp_path: Path, values: np.ndarray) -> None:
     np.save(tmp_path / "scan.npy", values)
-    with pytest.raises(BundleError, match=r"expected (numbers of shape|samples from 0)"):
+    with pytest.raises(BundleError, match=r"expected (arrays of numbers of shape|samples from 0)"):
         list_images(tmp_path / "scan.npy")
