@@ -18,15 +18,16 @@ from slrig.importers.images import list_images
 from slrig.model import Black, Capture, Pixels, Size, White
 from slrig.patterns import encode
 
-CODE = ProjectorCode(Size(64, 48))
-PATTERNS = opencv_sequence(CODE, 26, (White(), Black()), references_first=False)
+CODE = ProjectorCode(Size(16, 12))
+PATTERNS = opencv_sequence(CODE, 18, (White(), Black()), references_first=False)
+WHITE, BLACK = 16, 17
 
 
 def photographed() -> list[Pixels]:
     """A camera's images of OpenCV's sequence, of an object with a texture, with samples up to 210."""
     sequence = encode(PATTERNS, CODE.size)
     shade = np.random.default_rng(2).uniform(0.5, 1.0, (96, 128))
-    images = [np.kron(sequence.image(index), np.ones((2, 2))) * shade * 0.76 + 16 for index in range(len(PATTERNS))]
+    images = [np.kron(sequence.image(index), np.ones((8, 8))) * shade * 0.76 + 16 for index in range(len(PATTERNS))]
     return [np.rint(image).astype(np.uint8) for image in images]
 
 
@@ -59,7 +60,7 @@ def columns_first(path: Path, images: Sequence[Pixels]) -> Path:
 
 
 def archive(path: Path, images: Sequence[Pixels]) -> Path:
-    np.savez_compressed(path / "scan.npz", images=np.stack(images), K=np.eye(3), seconds=np.arange(26.0))
+    np.savez_compressed(path / "scan.npz", images=np.stack(images), K=np.eye(3), seconds=np.arange(18.0))
     return path / "scan.npz"
 
 
@@ -118,16 +119,14 @@ def test_a_stack_of_each_camera_and_an_image_by_its_page(tmp_path: Path) -> None
     images = photographed()
     for camera in ("left", "right"):
         tiff_stack(tmp_path, images).rename(tmp_path / f"{camera}.tif")
-    (tmp_path / "list.csv").write_text(
-        "file,pattern,camera\n" + "".join(f"right.tif page {page},{word},eye\n" for page, word in ((24, "white"),
-        (25, "black"), (0, "column 0"), (1, "column 0 inverted")))
-    )  # fmt: skip
+    listed = {WHITE: "white", BLACK: "black", 0: "column 0", 1: "column 0 inverted"}
+    lines = [f"right.tif page {page},{words},eye" for page, words in listed.items()]
+    (tmp_path / "list.csv").write_text("\n".join(("file,pattern,camera", *lines)))
     capture, _ = imported(tmp_path, tmp_path / "list.csv")
-    assert [np.array_equal(shot.image, images[page]) for shot, page in zip(capture.shots, (24, 25, 0, 1), strict=True)]
+    for shot, page in zip(capture.shots, listed, strict=True):
+        assert np.array_equal(shot.image, images[page])
     found, _ = import_capture(tmp_path, tmp_path / "other", CODE, ImageNaming("opencv"))
-    capture = read_bundle(tmp_path / "other").capture
-    assert list(capture.cameras) == ["left", "right"]
-    assert [len(images) for images in found.cameras.values()] == [26, 26]
+    assert {name: len(each) for name, each in found.cameras.items()} == {"left": 18, "right": 18}
 
 
 def test_a_page_that_contradicts_is_named(tmp_path: Path) -> None:
@@ -185,9 +184,9 @@ def test_colour_in_a_video_and_in_an_array_is_kept_of_white_and_black(tmp_path: 
         (tmp_path / "bundle").rename(tmp_path / f"{source.suffix}-bundle")
         for shot, image in zip(capture.shots, coloured, strict=True):
             assert np.array_equal(shot.image, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
-            assert (shot.colour is None) == (shot.pattern < 24)
-        assert capture.shots[24].colour is not None
-        assert np.array_equal(capture.shots[24].colour, coloured[24])
+            assert (shot.colour is None) == (shot.pattern < WHITE)
+        assert capture.shots[WHITE].colour is not None
+        assert np.array_equal(capture.shots[WHITE].colour, coloured[WHITE])
 
 
 @pytest.mark.parametrize("held", [3, 6])
@@ -196,9 +195,9 @@ def test_a_video_that_holds_each_pattern_is_averaged(tmp_path: Path, held: int, 
     chance = np.random.default_rng(4)
     images, frames = photographed(), []
     for number, image in enumerate([images[-1], *images, images[-1]]):
-        idle = number in (0, 27)
+        idle = number in (0, 19)
         frames += [image.astype(float)] * (20 * held if idle else held + int(chance.integers(2)))
-        following = images[min(number, 25)]
+        following = images[min(number, BLACK)]
         if not idle:
             # The exposure of one frame falls into the change.
             share = chance.uniform(0.2, 0.8)
@@ -207,7 +206,7 @@ def test_a_video_that_holds_each_pattern_is_averaged(tmp_path: Path, held: int, 
         np.clip(frame + chance.normal(0, noise_dn, frame.shape), 0, 255).round().astype(np.uint8) for frame in frames
     ]
     found, _ = import_capture(video(tmp_path, noisy), tmp_path / "bundle", CODE, ImageNaming("opencv"))
-    assert f"scan.avi: {len(frames)} frames, 27 images" in found.notes[0]
+    assert f"scan.avi: {len(frames)} frames, 19 images" in found.notes[0]
     assert found.unassigned == ["scan.avi frame 0"]
     capture = read_bundle(tmp_path / "bundle").capture
     assert list(capture.patterns) == PATTERNS
