@@ -27,6 +27,7 @@ from slrig.importers.calibrations import centring_offset_px, read_any_calibratio
 from slrig.importers.images import (
     ENDINGS,
     SourceImage,
+    describe_mosaic,
     find_bit_depth,
     list_images,
     list_images_below,
@@ -43,7 +44,7 @@ MAX_LIST_BYTES = 2**20
 
 _MIN_DIFFERENCE = 0.02  # of full scale, between white and black where the projector's light falls
 _MIN_DIFFERENCE_TO_NOISE = 5.0  # of the same
-_NOISE_ROWS = 128  # of an image, whose adjacent pixels show the noise of a difference
+_NOISE_ROWS = 128  # of an image, whose neighbouring pixels show the noise of a difference
 _MIN_DIFFERING_FRACTION = 0.002  # of all pixels, for a comparison of two images
 _MIN_AGREEING_FRACTION = 0.98  # of the differing pixels, brighter in the same image
 
@@ -294,6 +295,9 @@ def import_capture(
     with BundleWriter(output, code.size, patterns, formats, calibration) as writer:
         for name, files in images.cameras.items():
             images.faults += _write_camera(writer, name, files, formats[name], patterns)
+            white = next((image for image, pattern in files if isinstance(pattern, White)), None)
+            mosaic = describe_mosaic(white.read(formats[name])[0]) if white else ""
+            images.notes += [f"{name}: {mosaic}"] if mosaic else []
     return images, path
 
 
@@ -521,7 +525,8 @@ def _write_camera(
 def _first_is_brighter(first: Pixels, second: Pixels, full_scale: int) -> bool | None:
     """Return True or False if one of two images is brighter wherever they differ; None if neither is."""
     difference = first.astype(np.int32) - second
-    step = np.diff(difference[:: max(1, len(difference) // _NOISE_ROWS)], axis=1)
+    sampled = difference[:: max(1, len(difference) // _NOISE_ROWS)]
+    step = sampled[:, 2:] - sampled[:, :-2]  # of the same colour behind a filter
     noise = 1.4826 * float(np.median(np.abs(step))) / 2**0.5 if step.size else 0.0
     differs = np.abs(difference) > max(_MIN_DIFFERENCE * full_scale, _MIN_DIFFERENCE_TO_NOISE * noise)
     if differs.mean() < _MIN_DIFFERING_FRACTION:

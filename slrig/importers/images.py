@@ -22,6 +22,8 @@ IMAGES = {".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"}
 ENDINGS = IMAGES | STACKS | VIDEOS
 
 _USUAL_BITS = (10, 12, 14, 16)  # of samples in words of 16
+_MIN_MOSAIC = 0.05  # of the mean of a block, between the green sites of a mosaic and the others
+_MAX_GREEN_DIFFERENCE = 0.02  # of the same, between the green sites
 _SAMPLED_ROWS = 64  # of an image, whose samples tell the step of the values
 
 
@@ -164,3 +166,22 @@ def find_bit_depth(images: Iterable[SourceImage], camera: CameraFormat) -> tuple
     if bits == camera.bit_depth:
         return bits, ""
     return bits, f"samples up to {brightest}, taken as {bits} bits; if the camera has more, say --bit-depth"
+
+
+def describe_mosaic(white: Pixels) -> str:
+    """Return in words that an image in white light is a raw one of a colour sensor; empty for any other image.
+
+    Behind a Bayer filter two sites of each block of 2 x 2 pixels, on a diagonal, are green and differ from the others.
+    Grey sensors, and converted colours, have equal sites in the median over the bright blocks.
+    """
+    rows, columns = (side // 2 * 2 for side in white.shape)
+    sites = [white[i:rows:2, j:columns:2].astype(np.float32) for i, j in ((0, 0), (1, 1), (0, 1), (1, 0))]
+    mean = sum(sites) / np.float32(4)
+    is_bright = mean > np.median(mean)
+    if not is_bright.any():
+        return ""
+    one, other, third, fourth = (float(np.median(site[is_bright] / mean[is_bright])) for site in sites)
+    is_diagonal = min(abs(one - other), abs(third - fourth)) < _MAX_GREEN_DIFFERENCE
+    if abs(one + other - third - fourth) < 2 * _MIN_MOSAIC or not is_diagonal:
+        return ""
+    return "raw samples of a colour sensor (Bayer), taken as grey: the mesh is as good, its colours are not"

@@ -26,7 +26,7 @@ WHITE, BLACK = 16, 17
 def photographed() -> list[Pixels]:
     """A camera's images of OpenCV's sequence, of an object with a texture, with samples up to 210."""
     sequence = encode(PATTERNS, CODE.size)
-    shade = np.random.default_rng(2).uniform(0.5, 1.0, (96, 128))
+    shade = cv2.GaussianBlur(np.random.default_rng(2).uniform(0.0, 1.5, (96, 128)), None, 4.0)
     images = [np.kron(sequence.image(index), np.ones((8, 8))) * shade * 0.76 + 16 for index in range(len(PATTERNS))]
     return [np.rint(image).astype(np.uint8) for image in images]
 
@@ -167,6 +167,16 @@ def test_bits_and_alignment_of_samples_are_found(tmp_path: Path, bits: int, shif
     assert capture.cameras["cam0"].bit_depth == depth
     assert [words in note for note in notes] == ([True] if words else [])
     assert np.array_equal(capture.shots[3].image, deep[3])
+
+
+def test_raw_samples_of_a_colour_sensor_are_named(tmp_path: Path) -> None:
+    filtered = np.ones((96, 128))
+    filtered[::2, ::2], filtered[1::2, 1::2] = 0.55, 0.7
+    for name, gains in (("grey", np.ones((96, 128))), ("raw", filtered)):
+        (tmp_path / name).mkdir()
+        images = [np.rint(image * gains).astype(np.uint8) for image in photographed()]
+        _, notes = imported(array(tmp_path / name, images))
+        assert ["Bayer" in note for note in notes] == ([True] if name == "raw" else [])
 
 
 def test_a_video_of_16_bits_keeps_them(tmp_path: Path) -> None:
