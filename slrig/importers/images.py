@@ -176,7 +176,7 @@ def describe_mosaic(white: Pixels) -> str:
     """
     rows, columns = (side // 2 * 2 for side in white.shape)
     sites = [white[i:rows:2, j:columns:2].astype(np.float32) for i, j in ((0, 0), (1, 1), (0, 1), (1, 0))]
-    mean = sum(sites) / np.float32(4)
+    mean = np.mean(sites, axis=0)
     is_bright = mean > np.median(mean)
     if not is_bright.any():
         return ""

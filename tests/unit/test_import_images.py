@@ -195,8 +195,9 @@ def test_colour_in_a_video_and_in_an_array_is_kept_of_white_and_black(tmp_path: 
         for shot, image in zip(capture.shots, coloured, strict=True):
             assert np.array_equal(shot.image, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
             assert (shot.colour is None) == (shot.pattern < WHITE)
-        assert capture.shots[WHITE].colour is not None
-        assert np.array_equal(capture.shots[WHITE].colour, coloured[WHITE])
+        kept = capture.shots[WHITE].colour
+        assert kept is not None
+        assert np.array_equal(kept, coloured[WHITE])
 
 
 @pytest.mark.parametrize("held", [3, 6])
