@@ -13,7 +13,11 @@ from slrig.errors import ConfigError
 
 def import_images(
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="Folder of images, of one camera or with a subfolder for each.")
+        Path,
+        typer.Argument(
+            metavar="FOLDER",
+            help="Folder of images, of one camera or with a subfolder for each; or a TIFF, .npy, .npz or video of all.",
+        ),
     ],
     output: Annotated[Path, typer.Option(help="The bundle to write: a new folder.")],
     projector: Annotated[str, typer.Option(help="Columns x rows of the projector, as 1024x768.")],
@@ -57,7 +61,7 @@ def import_images(
         list[str] | None, typer.Option(help="Name of a camera, in the order of their folders; may be repeated.")
     ] = None,
     bit_depth: Annotated[
-        int | None, typer.Option(min=1, max=16, help="Bits of a sample, right-aligned. Default: 8 or 16, as the files.")
+        int | None, typer.Option(min=1, max=16, help="Bits of a sample, right-aligned. Default: found in the images.")
     ] = None,
     calibration: Annotated[
         Path | None,
@@ -100,6 +104,8 @@ def import_images(
     )
     for name, files in found.cameras.items():
         typer.echo(f"{'camera':<11}{name}: {len(files)} images, {files[0][0].name} to {files[-1][0].name}")
+    for note in found.notes:
+        typer.echo(f"{'taken':<11}{note}")
     for fault in found.faults:
         typer.echo(f"{'doubtful':<11}{fault}")
     if found.unassigned:

@@ -39,6 +39,7 @@ from slrig.reconstruction.frames import (
     linearise,
     mean_image,
     reference_repeats,
+    sample_format,
     used_frames,
     used_shots,
 )
@@ -158,6 +159,7 @@ __all__ = [
     "projector_positions",
     "reference_repeats",
     "refine_pose",
+    "sample_format",
     "sampling_mm",
     "select_points",
     "share_in_front",
