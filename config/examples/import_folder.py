@@ -2,8 +2,8 @@
 
     python config/examples/import_folder.py images/ 1024x768 calibration.yml mesh/ cam0
 
-`images/` holds numbered images of one camera in the order of OpenCV's GrayCodePattern; `slrig import --help` lists
-other orders, and options for images that are named by their patterns.
+`images/` holds images of one camera, which tell by themselves what they show; `slrig import --help` lists options for
+those that do not.
 """
 
 import json

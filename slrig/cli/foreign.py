@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from slrig.cli.init import terminal
 from slrig.cli.options import Keys, Unit
 from slrig.errors import ConfigError
+
+if TYPE_CHECKING:
+    from slrig.importers import UnderstoodFolder
 
 
 def import_images(
@@ -38,7 +43,8 @@ def import_images(
         typer.Option(
             metavar="TEMPLATE",
             help="Names of images, as '{axis}_{bit:02}_{inverted}.png': fields axis, bit (0 the most significant) or "
-            "power (0 the least), inverted, camera.",
+            "power (0 the least), inverted, camera; or '*_{number}_{camera}.png': * is anything, {number} the order, "
+            "and the images tell their patterns.",
         ),
     ] = None,
     white: Annotated[
@@ -55,8 +61,12 @@ def import_images(
             help="CSV of file, pattern, camera: white, 'column 3', 'row 0 inverted', 'column line 2 of 8 width 1'.",
         ),
     ] = None,
-    cell_px: Annotated[int, typer.Option(min=1, help="Width of the finest Gray cell, projector pixels.")] = 1,
-    offset_px: Annotated[int, typer.Option(min=0, help="Added to a position before it is cut into cells.")] = 0,
+    cell_px: Annotated[
+        int | None, typer.Option(min=1, help="Width of the finest Gray cell, projector pixels. Default: found, or 1.")
+    ] = None,
+    offset_px: Annotated[
+        int | None, typer.Option(min=0, help="Added to a position before it is cut into cells. Default: found, or 0.")
+    ] = None,
     camera: Annotated[
         list[str] | None, typer.Option(help="Name of a camera, in the order of their folders; may be repeated.")
     ] = None,
@@ -72,36 +82,39 @@ def import_images(
     ] = None,
     unit: Unit = None,
     keys: Keys = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Take what was found in the images without a question.")] = False,
+    save_list: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write what was found as a CSV file for --list.")
+    ] = None,
 ) -> None:
     """Make a bundle of another program's images.
 
-    Gray codes of OpenCV, scan3d-capture and SLStudio, or of named images. Then: slrig reconstruct.
+    The images themselves tell which Gray codes and lines they show; a picture beside the bundle shows what each was
+    taken for. Or state the order of a program, or names. Then: slrig reconstruct.
     """
-    from slrig.importers import ImageNaming, ProjectorCode, import_capture, parse_size
+    from slrig.importers import ImageNaming, ProjectorCode, assign_images, import_capture, parse_size, write_list
 
     ways = {"--format": program, "--pattern": pattern, "--names": names, "--list": listed}
     asked = [way for way, value in ways.items() if value is not None]
     if len(asked) > 1 or ((white or black) and names is None):
         message = f"expected one of {', '.join(ways)}, and --white and --black with --names, found {', '.join(asked)}"
         raise ConfigError(message)
-    if program in ("scan3d", "slstudio") and (cell_px, offset_px) != (1, 0):
+    if program in ("scan3d", "slstudio") and (cell_px, offset_px) != (None, None):
         message = (
             f"--format {program}: expected no --cell-px and --offset-px, which its order says itself; say --pattern"
         )
         raise ConfigError(message)
-    naming = ImageNaming(program or (None if asked else "opencv"), pattern, names, white, black, listed)
+    naming = ImageNaming(program, pattern, names, white, black, listed)
     code = ProjectorCode(parse_size(projector), cell_px=cell_px, offset_px=offset_px)
-    found, used = import_capture(
-        folder,
-        output,
-        code,
-        naming,
-        names=camera or (),
-        bit_depth=bit_depth,
-        calibration_file=calibration,
-        unit=unit,
+    found = assign_images(folder, code, naming)
+    if save_list is not None:
+        write_list(save_list, folder, found)
+    if found.understood is not None:
+        _propose(found.understood, output.with_name(f"{output.name}-sheet.png"), yes=yes)
+    used = import_capture(
+        folder, output, code, found, names=camera or (), bit_depth=bit_depth, calibration_file=calibration, unit=unit,
         keys=keys or (),
-    )
+    )  # fmt: skip
     for name, files in found.cameras.items():
         typer.echo(f"{'camera':<11}{name}: {len(files)} images, {files[0][0].name} to {files[-1][0].name}")
     for note in found.notes:
@@ -112,8 +125,32 @@ def import_images(
         some = ", ".join(found.unassigned[:5]) + (" …" if len(found.unassigned) > 5 else "")
         typer.echo(f"{'left out':<11}{len(found.unassigned)} images that no pattern is known of: {some}")
     typer.echo(f"{'bundle':<11}{output}")
-    how = "" if used is not None else " --decode-only"
+    words = ["slrig", "reconstruct", str(output), "--output", f"{output.name}-mesh"]
+    words += [] if used is not None else ["--decode-only"]
     typer.echo(f"{'calibrated':<11}{used or 'no: it can only be decoded'}")
     for note in found.calibration_notes:
         typer.echo(f"{'':<11}{note}")
-    typer.echo(f"To go on: slrig reconstruct {output} --output {output.name}-mesh{how}")
+    typer.echo(f"To go on: {shlex.join(words)}")
+
+
+def _propose(found: UnderstoodFolder, sheet: Path, *, yes: bool) -> None:
+    """Print what images were taken for, draw it, ask. Raises ConfigError: it is doubtful, and nobody can be asked."""
+    from slrig.importers import write_contact_sheet
+
+    write_contact_sheet(sheet, found)
+    for fact in found.facts:
+        typer.echo(f"{'found':<11}{fact}")
+    for doubt in found.doubts:
+        typer.echo(f"{'doubtful':<11}{doubt}")
+    typer.echo(f"{'look at':<11}{sheet}")
+    if yes:
+        return
+    if terminal():
+        if not typer.confirm("Take the images for this?", default=not found.doubts):
+            raise typer.Exit(1)
+    elif found.doubts:
+        message = (
+            f"what the images show is doubtful: {'; '.join(found.doubts)}. Look at {sheet}; if it is right, add --yes; "
+            "otherwise describe the images by --format, --pattern, --names or --list"
+        )
+        raise ConfigError(message)

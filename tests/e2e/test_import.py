@@ -25,6 +25,7 @@ from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
 from tests.e2e.conftest import write_rig
 from tests.golden.test_bundles import reconstructed
+from tests.rendered_folders import understand_folder_of
 from tests.unit.command import slrig
 
 PROJECTOR = Size(200, 160)
@@ -83,7 +84,7 @@ def test_the_patterns_of_a_program_light_what_slrig_says(program: str) -> None:
 def test_opencv_itself_shows_these_patterns(size: Size) -> None:
     if not hasattr(cv2, "structured_light"):
         pytest.skip("needs OpenCV's extra modules: pip install opencv-contrib-python-headless")
-    from slrig.importers.captures import ProjectorCode, opencv_sequence
+    from slrig.importers.orders import ProjectorCode, opencv_sequence
 
     made, images = cv2.structured_light.GrayCodePattern.create(size.width_px, size.height_px).generate()
     assert made
@@ -166,8 +167,9 @@ def test_what_does_not_fit_is_refused_in_words(tmp_path: Path) -> None:
         said = " ".join(result.stderr.split())
         assert [word for word in says if word not in said] == [], said
 
-    count = "expected 42 images for a projector of 1280 x 800"
-    refused(whole, projector="1280x800", says=[count, "found 34"])
+    count = "expected 44 images for a projector of 1280 x 800: white, black, 42 of the code"
+    refused(whole, "--format", "opencv", projector="1280x800", says=[count, "found 34"])
+    refused(whole, projector="1280x800", says=["8 bits with cells of 1 px would end at column 255", "bundle-sheet.png"])
     refused(whole, "--pattern", "white black columns", says=["expected 18 images", "found 34"])
     refused(whole, "--pattern", "white, black, columns, rows", says=["2 frames ahead of their patterns"])
     refused(whole, "--format", "slstudio", says=["expected 10, 8, 16 images", "phase shifts are not supported"])
@@ -176,9 +178,10 @@ def test_what_does_not_fit_is_refused_in_words(tmp_path: Path) -> None:
     refused(whole, "--format", "scan3d", "--cell-px", 2, says=["expected no --cell-px and --offset-px"])
     refused(tmp_path / "none", says=["expected a folder of images"])
     (whole / "07.png").unlink()
-    refused(whole, says=["found 33 images"])
+    refused(whole, "--format", "opencv", says=["found 33"])
+    refused(whole, says=["no image shows column bit 3 inverse: a frame is missing"])
     cv2.imwrite(str(whole / "07.png"), images[7][:-1])
-    refused(whole, says=["07.png: expected 40 x 32 of 8 bits as 00.png, found 40 x 31"])
+    refused(whole, "--format", "opencv", says=["07.png: expected 40 x 32 of 8 bits as 00.png, found 40 x 31"])
     # Three steps of a phase instead of a code.
     phases = [np.tile(np.uint8(127 + 100 * np.cos(np.arange(64) / 5 + k)), (48, 1)) for k in (0, 2, 4)]
     three = lay_out(tmp_path / "three", phases, "frameSeq_{:02}.bmp")
@@ -395,3 +398,40 @@ def test_images_that_contradict_are_named_at_import(shared: Path, tmp_path: Path
     assert words in " ".join(result.output.split())
     assert ("doubtful" in result.output) is (kind in ("copy", "exchanged"))
     assert (result.exit_code, (tmp_path / "bundle").exists()) == ((2, False) if "ahead" in words else (0, True))
+
+
+# ---- folders that tell by themselves what they show
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 4, 8, 10, 18, 29, 37])
+def test_a_rendered_folder_is_understood_without_an_option(seed: int, tmp_path: Path) -> None:
+    folder, verdict = understand_folder_of(seed, tmp_path / "images")
+    assert verdict in ("right", "named"), folder.kinds
+
+
+def test_what_was_found_is_proposed_and_can_be_read_again(tmp_path: Path) -> None:
+    shown = photographed("opencv")
+    # The camera's name after the number, a time stamp before it, and all images one frame ahead.
+    shown.append(shown.pop(0))
+    folder = tmp_path / "images of a colleague"
+    folder.mkdir()
+    for number, image in enumerate(shown):
+        assert cv2.imwrite(str(folder / f"20240511_{101500 + 7 * number}_{number:02}_left.png"), image)
+    ask = (folder, "--projector", "200x160", "--output", tmp_path / "my bundle")
+    refused = run(*ask)
+    sheet = tmp_path / "my bundle-sheet.png"
+    assert refused.exit_code == 2
+    assert f"Look at {sheet}; if it is right, add --yes" in " ".join(refused.stderr.split())
+    assert cv2.imread(str(sheet)) is not None
+    taken = run(*ask, "--yes", "--save-list", tmp_path / "list.csv")
+    assert taken.exit_code == 0, taken.output
+    assert f"slrig reconstruct '{tmp_path / 'my bundle'}' --output 'my bundle-mesh'" in taken.output
+    again = imported(folder, tmp_path / "again", "--list", tmp_path / "list.csv")
+    one, other = read_bundle(tmp_path / "my bundle").capture, read_bundle(again).capture
+    assert set(one.patterns) == set(OWN["opencv"])
+    assert one.patterns == other.patterns
+    numbered = run(folder, "--projector", "200x160", "--output", tmp_path / "b", "--names", "*_{number}_{camera}.png")
+    assert "camera left: 34 images" in numbered.output
+    listed = run(folder, "--projector", "200x160", "--output", tmp_path / "c", "--format", "opencv")
+    assert "34 cameras of one image each" in " ".join(listed.stderr.split())

@@ -14,18 +14,17 @@ import yaml
 from slrig.bundle import read_calibration, write_calibration
 from slrig.errors import BundleError, CalibrationError, PatternError, SlrigError
 from slrig.importers.calibrations import import_calibration, write_any_calibration
-from slrig.importers.captures import (
-    ImageNaming,
+from slrig.importers.captures import ImageNaming, assign_images, import_capture, parse_size
+from slrig.importers.documents import MAX_YAML_BYTES, read_yaml
+from slrig.importers.orders import (
     ProjectorCode,
     compile_name_template,
-    import_capture,
-    parse_size,
     pattern_from_name,
+    pattern_words,
     scan3d_sequence,
     slstudio_sequence,
 )
-from slrig.importers.documents import MAX_YAML_BYTES, read_yaml
-from slrig.model import Axis, Black, Calibration, Gray, LineShift, Pattern, Pinhole, Size, White
+from slrig.model import Axis, Black, Calibration, Gray, LineShift, Pattern, Pinhole, Sine, Size, White
 from tests.samples import sample_calibration
 from tests.strangers import harmed
 from tests.unit.calibrate_command import refused, run
@@ -332,10 +331,13 @@ CODE = ProjectorCode(Size(1824, 1140), cell_px=2)
         ("rows  9 plain", Gray(Axis.ROW, 9, 10, 2)),
         ("column line 2 of 8", LineShift(Axis.COLUMN, 2, 8)),
         ("row line 0 of 12 width 3", LineShift(Axis.ROW, 0, 12, 3)),
+        ("row 2 of 9 cell 4 offset 112 inverted", Gray(Axis.ROW, 2, 9, 4, 112, inverted=True)),
+        ("column sine 1 of 4 period 18.5", Sine(Axis.COLUMN, 18.5, 1, 4)),
     ],
 )
-def test_pattern_texts_are_parsed(words: str, wanted: Pattern) -> None:
+def test_pattern_texts_are_parsed_and_written(words: str, wanted: Pattern) -> None:
     assert CODE.parse_pattern(words) == wanted
+    assert CODE.parse_pattern(pattern_words(wanted)) == wanted
 
 
 @pytest.mark.parametrize(
@@ -430,6 +432,11 @@ def test_an_extent_is_two_numbers(words: str) -> None:
 )
 def test_a_list_that_is_wrong_is_refused(tmp_path: Path, lines: str, said: str) -> None:
     (tmp_path / "list.csv").write_text(lines)
+
+    def read() -> None:
+        images = assign_images(tmp_path, CODE, ImageNaming(listed=tmp_path / "list.csv"))
+        import_capture(tmp_path, tmp_path / "bundle", CODE, images)
+
     with pytest.raises(BundleError) as caught:
-        import_capture(tmp_path, tmp_path / "bundle", CODE, ImageNaming(listed=tmp_path / "list.csv"))
+        read()
     assert said in str(caught.value)

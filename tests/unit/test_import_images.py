@@ -13,8 +13,9 @@ from PIL import Image
 
 from slrig.bundle import read_bundle
 from slrig.errors import BundleError
-from slrig.importers.captures import ImageNaming, ProjectorCode, import_capture, opencv_sequence
+from slrig.importers.captures import ImageAssignment, ImageNaming, assign_images, import_capture
 from slrig.importers.images import list_images
+from slrig.importers.orders import ProjectorCode, opencv_sequence
 from slrig.model import Black, Capture, Pixels, Size, White
 from slrig.patterns import encode
 
@@ -31,10 +32,16 @@ def photographed() -> list[Pixels]:
     return [np.rint(image).astype(np.uint8) for image in images]
 
 
+def taken(source: Path, bundle: Path, naming: ImageNaming) -> ImageAssignment:
+    found = assign_images(source, CODE, naming)
+    import_capture(source, bundle, CODE, found)
+    return found
+
+
 def imported(source: Path, listed: Path | None = None) -> tuple[Capture, list[str]]:
     naming = ImageNaming("opencv") if listed is None else ImageNaming(listed=listed)
     bundle = (source if source.is_dir() else source.parent) / "bundle"
-    found, _ = import_capture(source, bundle, CODE, naming)
+    found = taken(source, bundle, naming)
     return read_bundle(bundle).capture, found.notes
 
 
@@ -125,14 +132,14 @@ def test_a_stack_of_each_camera_and_an_image_by_its_page(tmp_path: Path) -> None
     capture, _ = imported(tmp_path, tmp_path / "list.csv")
     for shot, page in zip(capture.shots, listed, strict=True):
         assert np.array_equal(shot.image, images[page])
-    found, _ = import_capture(tmp_path, tmp_path / "other", CODE, ImageNaming("opencv"))
+    found = taken(tmp_path, tmp_path / "other", ImageNaming("opencv"))
     assert {name: len(each) for name, each in found.cameras.items()} == {"left": 18, "right": 18}
 
 
 def test_a_page_that_contradicts_is_named(tmp_path: Path) -> None:
     images = photographed()
     images[5] = images[4]
-    found, _ = import_capture(tiff_stack(tmp_path, images), tmp_path / "bundle", CODE, ImageNaming("opencv"))
+    found = taken(tiff_stack(tmp_path, images), tmp_path / "bundle", ImageNaming("opencv"))
     assert any("scan.tif page 5 is a copy of image scan.tif page 4" in fault for fault in found.faults)
 
 
@@ -216,7 +223,7 @@ def test_a_video_that_holds_each_pattern_is_averaged(tmp_path: Path, held: int, 
     noisy = [
         np.clip(frame + chance.normal(0, noise_dn, frame.shape), 0, 255).round().astype(np.uint8) for frame in frames
     ]
-    found, _ = import_capture(video(tmp_path, noisy), tmp_path / "bundle", CODE, ImageNaming("opencv"))
+    found = taken(video(tmp_path, noisy), tmp_path / "bundle", ImageNaming("opencv"))
     assert f"scan.avi: {len(frames)} frames, 19 images" in found.notes[0]
     assert found.unassigned == ["scan.avi frame 0"]
     capture = read_bundle(tmp_path / "bundle").capture

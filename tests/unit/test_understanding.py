@@ -1,0 +1,138 @@
+"""What images of a folder show, found from small images of a bent screen without any names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slrig.errors import BundleError
+from slrig.importers.detection import sample_image
+from slrig.importers.understanding import Understanding, understand
+from slrig.model import Axis, Black, FloatArray, Gray, LineShift, Pattern, Pixels, Size, White
+from tests.rendered_folders import pattern_light
+
+PROJECTOR = Size(200, 150)
+CAMERA = (210, 280)
+ENDS: list[Pattern] = [White(), Black()]
+
+
+def screen() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Projector column and row at each pixel of a bent screen, and its albedo: the middle of the light."""
+    y, x = np.mgrid[: CAMERA[0], : CAMERA[1]].astype(np.float64)
+    column = 18 + 0.6 * x + 3 * np.sin(y / 35) + 0.02 * y
+    row = 12 + 0.6 * y + 2 * np.sin(x / 50)
+    return column, row, 0.65 + 0.3 * np.sin(x / 17) * np.cos(y / 23)
+
+
+def photographed(patterns: Sequence[Pattern], *, noise: float = 1.0, factors: Sequence[float] = ()) -> list[Pixels]:
+    """Images of patterns, blurred by the size of a pixel; factors : of the light of each."""
+    column, row, albedo = screen()
+    lit = (np.hypot(*(np.mgrid[: CAMERA[0], : CAMERA[1]] - np.array([105, 140])[:, None, None])) < 130).astype(
+        np.float64
+    )
+    rng, images = np.random.default_rng(3), []
+    for place, pattern in enumerate(patterns):
+        light = pattern_light(pattern, PROJECTOR).astype(np.float64) / 255
+        steps = np.linspace(-0.4, 0.4, 5)
+        if light.size == 1:
+            value = np.full(CAMERA, light[0, 0])
+        else:
+            at = column if light.shape[0] == 1 else row
+            flat = light.ravel()
+            value = np.mean([flat[np.clip(np.rint(at + step), 0, len(flat) - 1).astype(int)] for step in steps], axis=0)
+        image = (8 + 170 * value * albedo * lit) * (factors[place] if len(factors) else 1.0)
+        images.append(np.clip(image + rng.normal(0, noise, CAMERA), 0, 255).astype(np.uint8))
+    return images
+
+
+def bits(axis: Axis, *, cell: int = 1, offset: int = 0, inverses: bool = True) -> list[Gray]:
+    count = ((PROJECTOR.along(axis) - 1 + offset) // cell).bit_length()
+    both = (False, True) if inverses else (False,)
+    return [Gray(axis, bit, count, cell, offset, inverted) for bit in range(count) for inverted in both]
+
+
+def understood(images: Sequence[Pixels], **options: int) -> Understanding:
+    return understand([sample_image(each) for each in images], PROJECTOR, "image {}".format, **options)
+
+
+COLUMNS, ROWS = bits(Axis.COLUMN), bits(Axis.ROW)
+LINES = [LineShift(Axis.COLUMN, shift, 8, 4) for shift in range(8)]
+ORDERS: dict[str, list[Pattern]] = {
+    "white and black first": [*ENDS, *COLUMNS],
+    "both axes, references last": [*COLUMNS, *ROWS, *ENDS],
+    "rows first, fine to coarse": [*ENDS, *ROWS[::-1], *COLUMNS[::-1]],
+    "inverses after all bits": [*ENDS, *COLUMNS[::2], *COLUMNS[1::2]],
+    "axes mixed": [*ENDS, *(each for k in range(8) for axis in (COLUMNS, ROWS) for each in axis[2 * k : 2 * k + 2])],
+    "neither white nor black nor inverses": list(bits(Axis.COLUMN, inverses=False)),
+    "wider cells": [*ENDS, *bits(Axis.COLUMN, cell=2)],
+    "centred": [*ENDS, *bits(Axis.COLUMN, offset=28), *bits(Axis.ROW, offset=53)],
+    "lines": [*ENDS, *bits(Axis.COLUMN, cell=4), *LINES],
+}
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_orders_are_found_from_the_images(order: str) -> None:
+    shown = ORDERS[order]
+    found = understood(photographed(shown, noise=4.0))
+    assert found.patterns == shown
+
+
+def test_one_factor_of_light_per_image_is_free_and_named() -> None:
+    shown = ORDERS["both axes, references last"]
+    found = understood(photographed(shown, factors=[1 + 0.3 * np.sin(2.1 * place) for place in range(len(shown))]))
+    assert found.patterns == shown
+    assert not found.doubts
+    assert any("automatic exposure" in fact for fact in found.facts)
+
+
+def test_an_image_that_is_missing_doubled_or_out_of_place_is_doubtful() -> None:
+    shown = ORDERS["white and black first"]
+    images = photographed(shown)
+    missing = understood([*images[:7], *images[8:]])
+    assert missing.patterns == [*shown[:7], *shown[8:]]
+    assert [doubt.text for doubt in missing.doubts] == ["no image shows column bit 2 inverse: a frame is missing"]
+    doubled = understood([*images[:8], images[7], *images[8:]])
+    assert doubled.patterns == [*shown[:8], None, *shown[8:]]
+    assert [(doubt.text, doubt.images) for doubt in doubled.doubts] == [
+        ("image 8 is a copy of image 7: left out", (8,))
+    ]  # fmt: skip
+    exchanged = [*images[:9], images[11], images[10], images[9], *images[12:]]
+    found = understood(exchanged)
+    assert found.patterns == [*shown[:9], shown[11], shown[10], shown[9], *shown[12:]]
+    assert [doubt.images for doubt in found.doubts] == [(9, 11)]
+
+
+def test_a_bit_without_any_image_is_named() -> None:
+    shown = ORDERS["neither white nor black nor inverses"]
+    with pytest.raises(BundleError, match="no image shows column bit 3 of 8, nor its inverse"):
+        understood(photographed([*shown[:3], *shown[4:]]))
+
+
+@pytest.mark.parametrize("rest", [[], LINES, ROWS], ids=["alone", "lines", "rows"])
+def test_a_code_with_an_inverted_first_bit_is_mirrored(rest: list[Pattern]) -> None:
+    code = bits(Axis.COLUMN, inverses=True)
+    played: list[Pattern] = [*ENDS, *code, *rest]
+    first = (Gray(Axis.COLUMN, 0, 8), Gray(Axis.COLUMN, 0, 8, inverted=True))
+    wrong = [each.inverse if isinstance(each, Gray) and each in first else each for each in played]
+    found = understood(photographed(wrong))
+    assert found.patterns == wrong
+    assert any("the code of columns is mirrored" in doubt.text for doubt in found.doubts)
+
+
+def test_too_few_bits_for_the_projector_are_said() -> None:
+    code = [replace(each, cell_px=8) for each in bits(Axis.COLUMN, cell=8)]
+    found = understood(photographed([*ENDS, *code]))
+    assert found.patterns == [*ENDS, *code]
+    assert "5 bits with cells of 1 px would end at column 31, the projector has 200: taken as cells of 8 px" in (
+        found.doubts[0].text
+    )
+
+
+def test_plain_binary_codes_are_refused() -> None:
+    binary = [LineShift(Axis.COLUMN, 2**s, 2 ** (s + 1), 2**s) for s in range(6, 0, -1)]
+    images = photographed([*ENDS, Gray(Axis.COLUMN, 0, 8), *binary])
+    with pytest.raises(BundleError, match="plain binary"):
+        understood(images)
