@@ -296,7 +296,7 @@ def judge(folder: Folder, understood: ImageAssignment | SlrigError) -> str:
         lacks_bit = "missing" in folder.kinds and "plain" in folder.kinds
         return "named" if lacks_bit and "no image shows" in str(understood) else "refused"
     found = {
-        path.relative_to(folder.path).as_posix(): pattern
+        path.place.relative_to(folder.path).as_posix(): pattern
         for files in understood.cameras.values()
         for path, pattern in files
     }

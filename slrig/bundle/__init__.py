@@ -22,6 +22,7 @@ from slrig.bundle.description import (
 from slrig.bundle.file_storage import MAX_STORAGE_BYTES, Value, read_file_storage
 from slrig.bundle.images import (
     read_frame_format,
+    read_page_formats,
     read_pages,
     read_with_colour,
 )
@@ -168,6 +169,7 @@ __all__ = [
     "read_json_model",
     "read_notes",
     "read_opencv_calibration",
+    "read_page_formats",
     "read_pages",
     "read_poses",
     "read_refused",

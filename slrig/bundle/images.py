@@ -26,8 +26,10 @@ from slrig.model import CameraFormat, Pixels, Size
 
 BMP_SIGNATURE = b"BM"
 _FILE_HEADER, _INFO_HEADER = 14, 40
-_BITS = {8: 1, 24: 3}
-"""Bytes of a sample, by bits."""
+_BITS = {8: 1, 24: 3, 32: 4}
+"""Bytes of a pixel, by bits."""
+_BMP_MASKS = struct.pack("<3I", 0xFF0000, 0xFF00, 0xFF)
+"""Bits of red, green and blue in a pixel of 32, where a BMP states them."""
 
 JPEG_SIGNATURE = b"\xff\xd8\xff"
 _END = b"\xff\xd9"
@@ -47,6 +49,8 @@ MAX_TIFF_TAGS = 256
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_GREY, PNG_COLOUR = 0, 2
+PNG_SAMPLES = {PNG_GREY: 1, PNG_COLOUR: 3, 4: 2, 6: 4}
+"""Samples of a pixel by kind of colour; 4 and 6 are grey and colour with alpha."""
 PNG_MAX_FILTER = 4
 """Highest filter number."""
 
@@ -56,6 +60,7 @@ PNG_HEADER = struct.Struct(">IIBBBBB")
 """Width, height, bits, colour, and methods of compression, filtering and interlacing."""
 
 TIFF_ZLIB = (8, 32946)  # compression: Adobe's deflate and the older one
+_TIFF_KINDS = (("MINISBLACK", 1), ("RGB", 3), ("RGB", 4))  # photometric interpretation and samples of a pixel
 TIFF_COMPRESSIONS = (1, 5, *TIFF_ZLIB)  # none, LZW
 MAX_FILE_BYTES = 2**31
 TIFF_FAULTS = (
@@ -122,7 +127,8 @@ class BmpHeader:
         size, width, height, _, bits, compression, _, _, _, colours = struct.unpack_from("<IiiHHIIiiI", data, 14)
         if size < _INFO_HEADER or width < 1 or height == 0:
             raise ValueError(f"a header of {size} bytes for {width} x {height} pixels")
-        if bits not in _BITS or compression:
+        has_masks = (bits, compression) == (32, 3) and data[54:66] == _BMP_MASKS
+        if bits not in _BITS or (compression and not has_masks):
             raise ValueError(f"{bits} bits, {'compressed' if compression else 'uncompressed'}")
         entries = (colours or 256) if bits == 8 else 0
         header = cls(
@@ -135,11 +141,15 @@ class BmpHeader:
         return header
 
     def decode(self, data: bytes) -> Pixels:
-        """Return (H, W) or, in colour, (H, W, 3) uint8, BGR. Raises ValueError if a sample is not in the palette."""
+        """Return (H, W) or, in colour, (H, W, 3) or (H, W, 4) uint8, BGR, with alpha if there is any.
+        Raises ValueError if a sample is not in the palette.
+        """
         rows = np.frombuffer(data, np.uint8, self.stride * self.height, self.first_byte).reshape(self.height, -1)
         rows = rows[:: -1 if self.upside_down else 1, : self.width * _BITS[self.bits]]
-        if self.bits == 24:
-            return np.ascontiguousarray(rows).reshape(self.height, self.width, 3)
+        if self.bits != 8:
+            pixels = np.ascontiguousarray(rows).reshape(self.height, self.width, -1)
+            # The fourth byte is often unused.
+            return pixels if pixels[..., 3:].any() else np.ascontiguousarray(pixels[..., :3])
         if int(rows.max()) >= self.palette_entries:
             raise ValueError(f"a sample of {int(rows.max())} and a palette of {self.palette_entries}")
         colours = np.frombuffer(data, np.uint8, 4 * self.palette_entries, self.header_bytes).reshape(-1, 4)[:, :3]
@@ -265,8 +275,9 @@ def undo_up_filter(rows: bytes, height: int, bits: int) -> Pixels | None:
 def read_pages(path: Path, pages: Sequence[int], camera: CameraFormat) -> dict[int, Pixels]:
     """Return pages of a frame file, each (H, W) uint8 or uint16 of the camera's extent.
 
-    Samples are right-aligned; colour becomes grey with the weights of Rec. 601. Raises BundleError: the file is
-    missing, cut, damaged, of another kind, extent or depth, or has no such page.
+    Samples are right-aligned; colour becomes grey with the weights of Rec. 601; an opaque alpha channel is ignored.
+    Raises BundleError: the file is missing, cut, damaged, transparent, of another kind, extent or depth, or has no such
+    page.
     """
     return read_with_colour(path, pages, camera)[0]
 
@@ -303,6 +314,7 @@ def read_with_colour(
     else:
         found = "an empty file" if not data else f"a file that begins with {data[:8]!r}"
         _refuse(path, "a PNG, TIFF, BMP or JPEG file", found, "save the frame as PNG")
+    images = {page: _opaque(path, page, image) for page, image in images.items()}
     grey = {page: _grey(path, page, image, camera) for page, image in images.items()}
     colours = {
         page: image for page, image in images.items() if page in colour_pages and image is not None and image.ndim == 3
@@ -314,7 +326,15 @@ def read_frame_format(path: Path) -> CameraFormat:
     """Return extent and bits of the samples, 8 or 16, of the first page of a frame file, from its header alone.
     Raises BundleError: the file is missing or cut, or `read_pages` does not read it.
     """
+    return read_page_formats(path)[0]
+
+
+def read_page_formats(path: Path) -> dict[int, CameraFormat]:
+    """Return extent and bits of the samples of the pages of a frame file, by number, from its headers alone: of the
+    first page, and of those others that have samples of 8 or 16 bits. Raises as `read_frame_format` does.
+    """
     data = _read_bytes(path)
+    others: list[tuple[int, int, int]] = []
     try:
         if data.startswith(PNG_SIGNATURE) and data[12:16] == b"IHDR" and len(data) >= 33:
             width, height, bits = PNG_HEADER.unpack(data[16:29])[:3]
@@ -327,13 +347,14 @@ def read_frame_format(path: Path) -> CameraFormat:
         elif data.startswith(TIFF_SIGNATURES):
             count_tiff_pages(data)
             with tifffile.TiffFile(io.BytesIO(data)) as tiff:
-                page = tiff.pages[0]
-                width, height, bits = page.imagewidth, page.imagelength, page.bitspersample
+                sizes = [(page.imagewidth, page.imagelength, page.bitspersample) for page in tiff.pages]
+                (width, height, bits), *others = sizes
         else:
             raise ValueError(f"a file that begins with {data[:8]!r}")
         if bits not in (8, 16):
             raise ValueError(f"samples of {bits} bits")
-        return CameraFormat(Size(width, height), bits)
+        pages = enumerate([(width, height, bits), *others])
+        return {page: CameraFormat(Size(w, h), depth) for page, (w, h, depth) in pages if depth in (8, 16)}
     except TIFF_FAULTS as cause:
         expected = "a whole PNG, TIFF, BMP or JPEG file of 8 or 16 bits"
         raise BundleError(f"{path}: expected {expected}, found {cause}; save the frame as PNG") from cause
@@ -379,9 +400,8 @@ def _png(path: Path, data: bytes, camera: CameraFormat) -> Pixels | None:
     if len(data) < 33 or data[12:16] != b"IHDR":
         _refuse(path, "a whole PNG file", f"{len(data)} bytes without a header", "copy the frame again")
     width, height, bits, colour, _, _, interlaced = PNG_HEADER.unpack(data[16:29])
-    if colour not in (PNG_GREY, PNG_COLOUR):
-        kind = "a palette" if colour == 3 else "an alpha channel"
-        _refuse(path, "a grey or colour PNG", f"one with {kind}", "save the frame as grey")
+    if colour not in PNG_SAMPLES:
+        _refuse(path, "a grey or colour PNG", "one with a palette", "save the frame as grey")
     if interlaced:
         _refuse(path, "a PNG line by line", "an interlaced one", "save the frame without interlacing")
     _check_header(path, width, height, bits, camera)
@@ -401,7 +421,7 @@ def _png(path: Path, data: bytes, camera: CameraFormat) -> Pixels | None:
         if kind_of_chunk == b"IEND":
             break
         offset = end
-    row_bytes = 1 + width * bits // 8 * (3 if colour == PNG_COLOUR else 1)
+    row_bytes = 1 + width * bits // 8 * PNG_SAMPLES[colour]
     rows = _inflate(compressed, row_bytes * height)
     if rows is None or len(rows) != row_bytes * height or max(rows[::row_bytes]) > PNG_MAX_FILTER:
         return None
@@ -428,7 +448,7 @@ def _bitmap(path: Path, data: bytes, camera: CameraFormat) -> Pixels:
         _check_header(path, header.width, header.height, 8, camera)
         return header.decode(data)
     except ValueError as cause:
-        _refuse(path, "a whole, uncompressed BMP of 8 or 24 bits", str(cause), "save the frame as PNG")
+        _refuse(path, "a whole, uncompressed BMP of 8, 24 or 32 bits", str(cause), "save the frame as PNG")
 
 
 def _jpeg(path: Path, data: bytes, camera: CameraFormat) -> Pixels | None:
@@ -449,7 +469,7 @@ def _check_tiff(path: Path, data: bytes, pages: Sequence[int], camera: CameraFor
             for index in dict.fromkeys(pages):
                 page = tiff.pages[index]
                 kind = getattr(page.photometric, "name", str(page.photometric))
-                if (kind, page.samplesperpixel) not in (("MINISBLACK", 1), ("RGB", 3)) or page.sampleformat != 1:
+                if (kind, page.samplesperpixel) not in _TIFF_KINDS or page.sampleformat != 1:
                     _refuse(
                         path,
                         f"unsigned grey or colour samples on page {index}",
@@ -502,6 +522,17 @@ def _tiff_page(data: bytes, page: int) -> Pixels | None:
         # libtiff is stricter than `_check_tiff` in some tags.
         return None
     return images[0] if decoded and images else None
+
+
+def _opaque(path: Path, page: int, image: Pixels | None) -> Pixels | None:
+    """Return an image without its alpha channel, grey if all colours are. Raises BundleError: it is transparent."""
+    if image is None or image.ndim != 3 or image.shape[2] != 4:
+        return image
+    if int(image[..., 3].min()) < np.iinfo(image.dtype).max:
+        where = int((image[..., 3] < np.iinfo(image.dtype).max).sum())
+        _refuse(path, "an opaque image", f"{where} transparent pixels on page {page}", "save the frame without alpha")
+    colours = image[..., :3]
+    return np.ascontiguousarray(colours[..., 0] if (colours == colours[..., :1]).all() else colours)
 
 
 def _grey(path: Path, page: int, image: Pixels | None, camera: CameraFormat) -> Pixels:

@@ -292,18 +292,25 @@ def deactivate(calibration: CalibrationId, service: ServiceOptions) -> None:
 @grouped
 def export(
     calibration: Annotated[
-        str, typer.Argument(metavar="ID_OR_FILE", help=f"{_ID_HELP} Or a file, or a folder as ROS has it.")
-    ],
+        str | None, typer.Argument(metavar="ID_OR_FILE", help=f"{_ID_HELP} Or a file, or a folder as ROS has it.")
+    ] = None,
     file: Annotated[
-        Path,
+        Path | None,
         typer.Argument(metavar="FILE", help="File to write: .json, OpenCV's .yml or .xml, or the report as .html."),
-    ],
+    ] = None,
     to: Annotated[
         Literal["slrig", "opencv", "ros", "kalibr"] | None,
         typer.Option(help="Whose form. ros: a new folder of camera_info and transforms. Default: by the ending."),
     ] = None,
     unit: Unit = None,
     keys: Keys = None,
+    template: Annotated[
+        Path | None,
+        typer.Option(help="Write an empty calibration with explanations instead, to fill by hand: .json or .yml."),
+    ] = None,
+    camera: Annotated[
+        list[str] | None, typer.Option(help="With --template: name of a camera; may be repeated. Default: cam0.")
+    ] = None,
     *,
     service: ServiceOptions,
 ) -> None:
@@ -311,10 +318,20 @@ def export(
 
     Reads files of any program; writes the forms of slrig, OpenCV, ROS and Kalibr.
     """
-    if Path(calibration).exists() or to is not None or unit is not None or keys:
+    if template is not None and calibration is None:
+        from slrig.importers import write_template
+
+        write_template(template, camera or ["cam0"])
+        typer.echo(f"{'written':<10}{template}")
+        typer.echo(f"Fill it in, then: slrig calibrate import {template}, or slrig import --calibration {template}")
+        return
+    if template is not None or calibration is None or file is None:
+        raise ConfigError("expected ID_OR_FILE and FILE, or --template FILE alone; give one of the two")
+    name = FILES.get(file.suffix.lower())
+    if Path(calibration).exists() or to or unit or keys or name in ("calibration.yml", "calibration.xml"):
         import tempfile
 
-        from slrig.importers import import_calibration, write_any_calibration
+        from slrig.importers import import_calibration, lost_in_format, write_any_calibration
 
         with tempfile.TemporaryDirectory() as folder:
             source = Path(calibration)
@@ -323,11 +340,12 @@ def export(
                 with service.client() as client:
                     _fetch(client, calibration, source.name, source)
             read = import_calibration(source, unit=unit, keys=keys or ())
-            write_any_calibration(file, read.calibration, to)
+        write_any_calibration(file, read.calibration, to)
         for note in read.notes:
             typer.echo(f"{'read':<10}{note}")
+        for each in lost_in_format(read.calibration, file, to):
+            typer.echo(f"{'left out':<10}{each}")
     else:
-        name = FILES.get(file.suffix.lower())
         if name is None:
             message = (
                 f"{file}: expected a name that ends in .json (slrig's own), .yml or .xml (OpenCV's) or .html (the "

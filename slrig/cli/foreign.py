@@ -18,7 +18,11 @@ if TYPE_CHECKING:
 
 def import_images(
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="Folder of images, of one camera or with a subfolder for each.")
+        Path,
+        typer.Argument(
+            metavar="FOLDER",
+            help="Folder of images, of one camera or with a subfolder for each; or a TIFF, .npy, .npz or video of all.",
+        ),
     ],
     output: Annotated[Path, typer.Option(help="The bundle to write: a new folder.")],
     projector: Annotated[str, typer.Option(help="Columns x rows of the projector, as 1024x768.")],
@@ -67,7 +71,7 @@ def import_images(
         list[str] | None, typer.Option(help="Name of a camera, in the order of their folders; may be repeated.")
     ] = None,
     bit_depth: Annotated[
-        int | None, typer.Option(min=1, max=16, help="Bits of a sample, right-aligned. Default: 8 or 16, as the files.")
+        int | None, typer.Option(min=1, max=16, help="Bits of a sample, right-aligned. Default: found in the images.")
     ] = None,
     calibration: Annotated[
         Path | None,
@@ -108,18 +112,13 @@ def import_images(
     if found.understood is not None:
         _propose(found.understood, output.with_name(f"{output.name}-sheet.png"), yes=yes)
     used = import_capture(
-        folder,
-        output,
-        code,
-        found,
-        names=camera or (),
-        bit_depth=bit_depth,
-        calibration_file=calibration,
-        unit=unit,
+        folder, output, code, found, names=camera or (), bit_depth=bit_depth, calibration_file=calibration, unit=unit,
         keys=keys or (),
-    )
+    )  # fmt: skip
     for name, files in found.cameras.items():
         typer.echo(f"{'camera':<11}{name}: {len(files)} images, {files[0][0].name} to {files[-1][0].name}")
+    for note in found.notes:
+        typer.echo(f"{'taken':<11}{note}")
     for fault in found.faults:
         typer.echo(f"{'doubtful':<11}{fault}")
     if found.unassigned:

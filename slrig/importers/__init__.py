@@ -2,6 +2,7 @@
 
 from slrig.importers.calibrations import import_calibration, write_any_calibration
 from slrig.importers.captures import ImageNaming, assign_images, import_capture, parse_size, write_list
+from slrig.importers.exports import lost_in_format, write_template
 from slrig.importers.folders import UnderstoodFolder, write_contact_sheet
 from slrig.importers.orders import ProjectorCode
 
@@ -12,8 +13,10 @@ __all__ = [
     "assign_images",
     "import_calibration",
     "import_capture",
+    "lost_in_format",
     "parse_size",
     "write_any_calibration",
     "write_contact_sheet",
     "write_list",
+    "write_template",
 ]

@@ -169,8 +169,11 @@ def read_ros(folder: Path) -> tuple[Calibration, list[str]]:
             "the missing files"
         )
     poses = rectified or _read_ros_poses(folder / TRANSFORMS)
+    # Devices have the order of their transforms: the first camera is the reference.
+    frames = [frame.removesuffix(FRAME) for frame in poses]
+    names = sorted(infos, key=lambda name: frames.index(name) if name in frames else len(frames))
     notes: list[str] = []
-    devices = {name: _build_ros_device(files[name], info, poses, name, notes) for name, info in infos.items()}
+    devices = {name: _build_ros_device(files[name], infos[name], poses, name, notes) for name in names}
     projector = devices.pop(PROJECTOR, None)
     if not devices:
         raise CalibrationError(f"{folder}: expected a camera, found the projector alone; add its NAME.yaml")

@@ -7,7 +7,7 @@ import io
 import re
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +16,7 @@ from slrig.bundle import (
     MAX_CAMERA_PX,
     BundleWriter,
     check_calibration,
-    read_frame_format,
     read_text,
-    read_with_colour,
     write_file,
 )
 from slrig.capture import Evidence
@@ -26,14 +24,14 @@ from slrig.disk import storage_errors
 from slrig.errors import BundleError, PatternError
 from slrig.importers.calibrations import import_calibration
 from slrig.importers.coded_images import CodedImages
-from slrig.importers.folders import (
-    IMAGES,
-    UnderstoodFolder,
-    group_by_prefix,
-    groupings,
+from slrig.importers.folders import UnderstoodFolder, group_by_prefix, groupings, list_subfolders, understand_folder
+from slrig.importers.images import (
+    SourceImage,
+    describe_mosaic,
+    find_bit_depth,
     list_images,
-    list_subfolders,
-    understand_folder,
+    list_images_below,
+    without_idle_ends,
 )
 from slrig.importers.orders import (
     ProjectorCode,
@@ -51,7 +49,6 @@ MAX_LIST_BYTES = 2**20
 
 _STRONG = 0.5  # of the difference that 1 % of the pixels exceed
 _MIN_AGREEING_FRACTION = 0.98  # of the strongly differing pixels, brighter in the same image
-_MIN_BRIGHTEST_OF_16_BITS = 2**14
 _MAX_EXPLAINED = 2  # images of a known order that show another pattern: a copy, or two exchanged ones
 
 
@@ -72,15 +69,16 @@ class ImageNaming:
 @dataclass(slots=True)
 class ImageAssignment:
     """Images of each camera with their patterns. unassigned : names of images without a known pattern. faults : images
-    that contradict one another, each cause once. understood : what the images show, where they themselves tell it.
-    calibration_notes : what was read from the calibration's file.
+    that contradict one another, each cause once. notes : how stacks, videos and samples were taken. calibration_notes :
+    what was read from the calibration's file. understood : what the images show, where they themselves tell it.
     """
 
-    cameras: dict[str, list[tuple[Path, Pattern]]] = field(default_factory=dict)
+    cameras: dict[str, list[tuple[SourceImage, Pattern]]] = field(default_factory=dict)
     unassigned: list[str] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
-    understood: UnderstoodFolder | None = None
+    notes: list[str] = field(default_factory=list)
     calibration_notes: tuple[str, ...] = ()
+    understood: UnderstoodFolder | None = None
 
 
 def assign_images(folder: Path, code: ProjectorCode, naming: ImageNaming) -> ImageAssignment:
@@ -103,7 +101,8 @@ def import_capture(
     unit: LengthUnit | None = None,
     keys: Sequence[str] = (),
 ) -> Path | None:
-    """Write the images of `folder` as the bundle `output`; return the calibration file that was used.
+    """Write the images of `folder`, or of a file of several, as the bundle `output`; return the calibration file that
+    was used.
 
     The images are checked against one another. Those that contradict are named, and reconstruction does not use what is
     proven wrong; if they do not come in the order of their patterns, nothing is written.
@@ -120,20 +119,16 @@ def import_capture(
             message = f"{folder}: expected {len(images.cameras)} names of cameras ({known}), found {len(names)}"
             raise BundleError(message)
         images.cameras = dict(zip(names, images.cameras.values(), strict=True))
-    formats = {name: _common_format(files, bit_depth) for name, files in images.cameras.items()}
-    is_depth_known = bit_depth is not None
-    if images.understood is not None and not is_depth_known:
-        is_depth_known = True
-        found = images.understood.sample_bits()
-        formats = {name: replace(form, bit_depth=found.get(name, form.bit_depth)) for name, form in formats.items()}
+    formats = {}
+    for name, files in images.cameras.items():
+        formats[name], note = _common_format(files, bit_depth)
+        images.notes += [f"{name}: {note}"] if note else []
     sizes = {name: each.size for name, each in formats.items()}
-    default_file = next((folder / each for each in CALIBRATIONS if (folder / each).is_file()), None)
+    default_file = next((_home(folder) / each for each in CALIBRATIONS if (_home(folder) / each).is_file()), None)
     path, calibration = calibration_file or default_file, None
     if path is not None:
         bits = {p.axis: p for files in images.cameras.values() for _, p in files if isinstance(p, Gray)}
-        capture = CodedImages(
-            images.cameras, formats, code.size, lambda image, form: read_with_colour(image, (0,), form)[0][0]
-        )
+        capture = CodedImages(images.cameras, formats, code.size, lambda image, form: image.read(form)[0])
         read = import_calibration(
             path, cameras=sizes, projector=code.size, bits=bits, capture=capture, unit=unit, keys=keys
         )
@@ -142,36 +137,51 @@ def import_capture(
     patterns = list(dict.fromkeys(pattern for files in images.cameras.values() for _, pattern in files))
     with BundleWriter(output, code.size, patterns, formats, calibration) as writer:
         for name, files in images.cameras.items():
-            images.faults += _write_camera(writer, name, files, formats[name], patterns, is_depth_given=is_depth_known)
+            images.faults += _write_camera(writer, name, files, formats[name], patterns)
+            white = next((image for image, pattern in files if isinstance(pattern, White)), None)
+            mosaic = describe_mosaic(white.read(formats[name])[0]) if white else ""
+            images.notes += [f"{name}: {mosaic}"] if mosaic else []
     return path
 
 
+def _home(source: Path) -> Path:
+    """Return the folder of a source of images: itself, or that of a file of several."""
+    return source if source.is_dir() else source.parent
+
+
 def _assign_images(folder: Path, code: ProjectorCode, naming: ImageNaming) -> ImageAssignment:
-    if not folder.is_dir():
-        raise BundleError(f"{folder}: expected a folder of images, found none; check the path")
+    if not folder.exists():
+        raise BundleError(f"{folder}: expected a folder of images, or a file of several, found none; check the path")
     if naming.listed is not None:
         return _assign_from_list(folder, code, naming.listed)
     if naming.names is not None:
         return _assign_by_names(folder, code, naming)
+    images, notes = list_images(folder)
+    if not images:
+        groups, notes = list_subfolders(folder)
     if naming.program is None and naming.order is None:
-        return _assign_by_looks(folder, code)
-    return _assign_by_order(folder, code, naming, _group_by_camera(folder))
+        assigned = _assign_by_looks(folder, code, images, {} if images else groups)
+    else:
+        assigned = _assign_by_order(folder, code, naming, group_by_prefix(images) if images else groups)
+    assigned.notes = notes
+    return assigned
 
 
-def _assign_by_looks(folder: Path, code: ProjectorCode) -> ImageAssignment:
+def _assign_by_looks(
+    folder: Path, code: ProjectorCode, images: Sequence[SourceImage], subfolders: dict[str, list[SourceImage]]
+) -> ImageAssignment:
     """Find what images show; a known order of so many images counts where they do not contradict it."""
-    images = list_images(folder)
     known: ImageAssignment | None = None
     with suppress(BundleError, PatternError):
-        known = _assign_by_order(folder, code, ImageNaming("opencv"), _group_by_camera(folder))
-    groups = groupings(images) if images else iter([list_subfolders(folder)])
+        known = _assign_by_order(folder, code, ImageNaming("opencv"), group_by_prefix(images) if images else subfolders)
+    groups = groupings(images) if images else iter([subfolders])
     try:
         found = understand_folder(groups, code.size, cell_px=code.stated_cell_px, offset_px=code.stated_offset_px)
     except BundleError as cause:
         raise BundleError(f"{folder}: {cause}") from cause
     if known is not None and _fits(known, found):
         return known
-    return ImageAssignment(found.assigned, [each.path.name for each in found.alone], understood=found)
+    return ImageAssignment(found.assigned, [each.image.name for each in found.alone], understood=found)
 
 
 def _fits(known: ImageAssignment, found: UnderstoodFolder) -> bool:
@@ -182,7 +192,7 @@ def _fits(known: ImageAssignment, found: UnderstoodFolder) -> bool:
 
 
 def _assign_by_order(
-    folder: Path, code: ProjectorCode, naming: ImageNaming, groups: dict[str, list[Path]]
+    folder: Path, code: ProjectorCode, naming: ImageNaming, groups: dict[str, list[SourceImage]]
 ) -> ImageAssignment:
     assigned = ImageAssignment()
     single = [files[0].name for files in groups.values() if len(files) == 1]
@@ -192,28 +202,41 @@ def _assign_by_order(
             "number; say where a name has the camera and the number, as --names '*_{number}_{camera}.png'"
         )
     for name, files in groups.items():
-        try:
-            patterns = _pattern_sequence(code, naming, files)
-        except BundleError as cause:
-            raise BundleError(f"{folder}, {name}: {cause}") from cause
-        if len(patterns) != len(files):
-            raise BundleError(
-                f"{folder}, {name}: expected {len(patterns)} images of '{naming.order}' on a projector of {code.size}, "
-                f"found {len(files)} ({files[0].name} to {files[-1].name}); correct --pattern or --projector"
-            )
-        assigned.cameras[name] = list(zip(files, patterns, strict=True))
+        assigned.cameras[name], left_out = _assign_in_order(f"{folder}, {name}", code, naming, files)
+        assigned.unassigned += left_out
     return assigned
 
 
-def _pattern_sequence(code: ProjectorCode, naming: ImageNaming, files: Sequence[Path]) -> list[Pattern]:
+def _assign_in_order(
+    place: str, code: ProjectorCode, naming: ImageNaming, images: Sequence[SourceImage]
+) -> tuple[list[tuple[SourceImage, Pattern]], list[str]]:
+    """Return the images of a camera with their patterns, and the names of idle images that were left out."""
+    faults = []
+    for files in without_idle_ends(images):
+        try:
+            patterns = _pattern_sequence(code, naming, files)
+        except BundleError as cause:
+            faults.append(BundleError(f"{place}: {cause}"))
+            continue
+        if len(patterns) == len(files):
+            return list(zip(files, patterns, strict=True)), [each.name for each in images if each not in files]
+        message = (
+            f"{place}: expected {len(patterns)} images of '{naming.order}' on a projector of {code.size}, "
+            f"found {len(files)} ({files[0].name} to {files[-1].name}); correct --pattern or --projector"
+        )
+        faults.append(BundleError(message))
+    raise faults[0]
+
+
+def _pattern_sequence(code: ProjectorCode, naming: ImageNaming, files: Sequence[SourceImage]) -> list[Pattern]:
     if naming.order is not None:
         return code.parse_sequence(naming.order)
     count = len(files)
     if naming.program == "opencv":
-        form = read_frame_format(files[0])
+        form = files[0].read_format()
         # OpenCV leaves the place and order of white and black to the program that saves the images.
         for references_first, pair in ((False, files[-2:]), (True, files[:2])):
-            images = [read_with_colour(each, (0,), form)[0][0] for each in pair]
+            images = [each.read(form)[0] for each in pair]
             brighter = _first_is_brighter(images[0], images[-1])
             if brighter is not None:
                 references: tuple[Pattern, ...] = (White(), Black()) if brighter else (Black(), White())
@@ -225,21 +248,16 @@ def _pattern_sequence(code: ProjectorCode, naming: ImageNaming, files: Sequence[
     return (scan3d_sequence if naming.program == "scan3d" else slstudio_sequence)(code, count)
 
 
-def _group_by_camera(folder: Path) -> dict[str, list[Path]]:
-    """Return the images in natural order, by subfolder, or by the part of their names before the last number."""
-    images = list_images(folder)
-    return group_by_prefix(images) if images else list_subfolders(folder)
-
-
 def _assign_by_names(folder: Path, code: ProjectorCode, naming: ImageNaming) -> ImageAssignment:
     bit_names = compile_name_template(str(naming.names))
     if "number" in bit_names.groupindex:
         return _assign_by_numbers(folder, code, bit_names, str(naming.names))
     templates: tuple[tuple[str | None, Pattern], ...] = ((naming.white, White()), (naming.black, Black()))
     references = [(compile_name_template(template), pattern) for template, pattern in templates if template is not None]
-    assigned = ImageAssignment()
-    for image in sorted((each for each in folder.rglob("*") if each.suffix.lower() in IMAGES), key=str):
-        name = image.relative_to(folder).as_posix()
+    images, notes = list_images_below(folder)
+    assigned = ImageAssignment(notes=notes)
+    for image in sorted(images, key=lambda each: str(each.place)):
+        name = image.place.relative_to(_home(folder)).as_posix()
         matches = [(match, pattern) for each, pattern in references if (match := each.fullmatch(name))]
         if match := bit_names.fullmatch(name):
             matches.append((match, pattern_from_name(code, match)))
@@ -257,19 +275,24 @@ def _assign_by_names(folder: Path, code: ProjectorCode, naming: ImageNaming) -> 
 
 def _assign_by_numbers(folder: Path, code: ProjectorCode, numbered: re.Pattern[str], template: str) -> ImageAssignment:
     """Find what images show that names put in order, by camera."""
-    groups: dict[str, list[tuple[int, Path]]] = {}
+    groups: dict[str, list[tuple[int, SourceImage]]] = {}
     unassigned = []
-    for image in sorted((each for each in folder.rglob("*") if each.suffix.lower() in IMAGES), key=str):
-        if match := numbered.fullmatch(image.relative_to(folder).as_posix()):
+    images, notes = list_images_below(folder)
+    for image in sorted(images, key=lambda each: str(each.place)):
+        name = image.place.relative_to(_home(folder)).as_posix()
+        if match := numbered.fullmatch(name):
             groups.setdefault(match.groupdict().get("camera") or "cam0", []).append((int(match["number"]), image))
         else:
-            unassigned.append(image.relative_to(folder).as_posix())
+            unassigned.append(name)
     if not groups:
         found = ", ".join(unassigned[:5]) or "no image"
         raise BundleError(f"{folder}: expected images called as {template}, found {found}; correct --names")
-    ordered = {name: [path for _, path in sorted(files)] for name, files in groups.items()}
+    ordered = {
+        name: [image for _, image in sorted(files, key=lambda each: (each[0], each[1].name))]
+        for name, files in groups.items()
+    }
     understood = understand_folder([ordered], code.size, cell_px=code.stated_cell_px, offset_px=code.stated_offset_px)
-    return ImageAssignment(understood.assigned, unassigned, understood=understood)
+    return ImageAssignment(understood.assigned, unassigned, notes=notes, understood=understood)
 
 
 def _assign_from_list(folder: Path, code: ProjectorCode, path: Path) -> ImageAssignment:
@@ -279,6 +302,7 @@ def _assign_from_list(folder: Path, code: ProjectorCode, path: Path) -> ImageAss
     if not {"file", "pattern"} <= columns <= {"file", "pattern", "camera"}:
         raise BundleError(f"{path}: expected the columns file, pattern and camera, found {', '.join(sorted(columns))}")
     assigned = ImageAssignment()
+    parts: dict[Path, SourceImage] = {}
     for number, row in enumerate(rows, 2):
         if None in row or row["pattern"] is None:
             raise BundleError(f"{path}: expected {len(columns)} cells in line {number}, found others; correct it")
@@ -286,7 +310,12 @@ def _assign_from_list(folder: Path, code: ProjectorCode, path: Path) -> ImageAss
             pattern = code.parse_pattern(row["pattern"])
         except BundleError as cause:
             raise BundleError(f"{path}, line {number}: {cause}") from cause
-        assigned.cameras.setdefault(row.get("camera") or "cam0", []).append((folder / row["file"], pattern))
+        place = _home(folder) / row["file"]
+        if not parts and not place.is_file():
+            images, assigned.notes = list_images_below(folder)
+            parts = {image.place: image for image in images}
+        image = parts.get(place) or SourceImage.of_file(place)
+        assigned.cameras.setdefault(row.get("camera") or "cam0", []).append((image, pattern))
     if not assigned.cameras:
         raise BundleError(f"{path}: expected a line for each image, found none")
     _require_complete_codes(folder, assigned)
@@ -299,7 +328,10 @@ def write_list(path: Path, folder: Path, images: ImageAssignment) -> None:
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(("file", "pattern", "camera"))
     for camera, files in images.cameras.items():
-        rows.writerows((file.relative_to(folder).as_posix(), pattern_words(pattern), camera) for file, pattern in files)
+        rows.writerows(
+            (image.place.relative_to(_home(folder)).as_posix(), pattern_words(pattern), camera)
+            for image, pattern in files
+        )
     write_file(path, text.getvalue().encode())
 
 
@@ -321,70 +353,65 @@ def _require_complete_codes(folder: Path, assigned: ImageAssignment) -> None:
                 )
 
 
-def _common_format(files: Sequence[tuple[Path, Pattern]], bit_depth: int | None) -> CameraFormat:
-    first = read_frame_format(files[0][0])
+def _common_format(files: Sequence[tuple[SourceImage, Pattern]], bit_depth: int | None) -> tuple[CameraFormat, str]:
+    """Return the format of all images of a camera, and how their samples lie in words of 16 bits, if not as usual."""
+    image = files[0][0]
+    first = image.read_format()
     if first.size.width_px * first.size.height_px > MAX_CAMERA_PX:
-        raise BundleError(
-            f"{files[0][0]}: expected at most {MAX_CAMERA_PX} pixels, found {first.size}; crop the images"
-        )
-    for path, _ in files:
-        each = read_frame_format(path)
+        message = f"{image.place}: expected at most {MAX_CAMERA_PX} pixels, found {first.size}; crop the images"
+        raise BundleError(message)
+    for other, _ in files:
+        each = other.read_format()
         if each != first:
             raise BundleError(
-                f"{path}: expected {first.size} of {first.bit_depth} bits as {files[0][0].name}, found {each.size} of "
+                f"{other.place}: expected {first.size} of {first.bit_depth} bits as {image.name}, found {each.size} of "
                 f"{each.bit_depth} bits; all images of a camera have one extent and depth"
             )
     if bit_depth is not None and (bit_depth > first.bit_depth or (bit_depth <= 8) != (first.bit_depth <= 8)):
-        message = f"{files[0][0]}: expected --bit-depth to fit samples of {first.bit_depth} bits, found {bit_depth}"
+        message = f"{image.place}: expected --bit-depth to fit samples of {first.bit_depth} bits, found {bit_depth}"
         raise BundleError(message)
-    return CameraFormat(first.size, bit_depth or first.bit_depth)
+    if bit_depth is not None or first.bit_depth == 8 or image.is_stretched:
+        return CameraFormat(first.size, bit_depth or first.bit_depth), ""
+    found, note = find_bit_depth((each for each, _ in files), first)
+    return CameraFormat(first.size, found), note
 
 
 def _write_camera(
     writer: BundleWriter,
     name: str,
-    files: Sequence[tuple[Path, Pattern]],
+    files: Sequence[tuple[SourceImage, Pattern]],
     form: CameraFormat,
     patterns: Sequence[Pattern],
-    *,
-    is_depth_given: bool,
 ) -> tuple[str, ...]:
     """Write the images of a camera; return how they contradict one another, each cause once. Raises BundleError."""
-    first = {pattern: path for path, pattern in reversed(files)}
+    first = {pattern: image for image, pattern in reversed(files)}
     shown = list(dict.fromkeys(pattern for _, pattern in files))
     evidence = Evidence(shown, {name: form}, frame_names={name: [f"image {first[pattern].name}" for pattern in shown]})
-    reference_frames: dict[str, tuple[Path, Pixels]] = {}
-    brightest = 0
+    reference_frames: dict[str, tuple[SourceImage, Pixels]] = {}
     # White and black come first, so that the other images need not wait for them.
     references: tuple[White | Black, ...] = (White(), Black())
     for reference in (each for each in references if each in first):
-        image = read_with_colour(first[reference], (0,), form)[0][0]
-        reference_frames[reference.kind] = (first[reference], image)
-        evidence.add_shot(Shot(shown.index(reference), name, image))
-    for path, pattern in files:
-        coloured = (0,) if isinstance(pattern, White | Black) else ()
-        grey, colour = read_with_colour(path, (0,), form, colour_pages=coloured)
-        writer.add(Shot(patterns.index(pattern), name, grey[0], colour=colour.get(0)))
-        brightest = max(brightest, int(grey[0].max()))
-        if path == first[pattern] and not isinstance(pattern, White | Black):
-            evidence.add_shot(Shot(shown.index(pattern), name, grey[0]))
-    if form.bit_depth > 8 and not is_depth_given and brightest < _MIN_BRIGHTEST_OF_16_BITS:
-        raise BundleError(
-            f"{files[0][0].parent}, {name}: expected samples over all of 16 bits, found {brightest} at most, so that "
-            "the saturation level is unknown; give the camera's number of bits, such as --bit-depth 12"
-        )
+        grey, _ = first[reference].read(form)
+        reference_frames[reference.kind] = (first[reference], grey)
+        evidence.add_shot(Shot(shown.index(reference), name, grey))
+    for image, pattern in files:
+        is_reference = isinstance(pattern, White | Black)
+        grey, colour = image.read(form, coloured=is_reference)
+        writer.add(Shot(patterns.index(pattern), name, grey, colour=colour))
+        if image is first[pattern] and not is_reference:
+            evidence.add_shot(Shot(shown.index(pattern), name, grey))
     summary = evidence.summary()
     if summary.misordered is not None:
         raise BundleError(
-            f"{files[0][0].parent}: {summary.misordered}; rename the images in the order of their patterns, or list "
-            "them with --list"
+            f"{files[0][0].path.parent}: {summary.misordered}; rename the images in the order of their patterns, or "
+            "list them with --list"
         )
     if len(reference_frames) == 2:
         (white, lit), (black, dark) = reference_frames["white"], reference_frames["black"]
         if not _first_is_brighter(lit, dark):
             raise BundleError(
-                f"{white}: expected white, and {black.name} black, found it not brighter wherever they differ; correct "
-                "the order. These may be phase shifts, not supported: slrig reads Gray codes and shifted lines"
+                f"{white.place}: expected white, and {black.name} black, found it not brighter wherever they differ; "
+                "correct the order. These may be phase shifts, not supported: slrig reads Gray codes and shifted lines"
             )
     return summary.faults
 

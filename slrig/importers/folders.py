@@ -11,15 +11,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from slrig.bundle import natural_sort_key, read_frame_format, read_with_colour, write_file
+from slrig.bundle import DESCRIPTION, natural_sort_key, write_file
 from slrig.errors import BundleError
 from slrig.importers.detection import Light, sample_image
+from slrig.importers.images import ENDINGS, SourceImage, list_images
 from slrig.importers.orders import pattern_words
 from slrig.importers.understanding import Understanding, understand
 from slrig.model import CameraFormat, Pattern, Pixels, Size
-from slrig.reconstruction import sample_format
-
-IMAGES = {".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"}
 
 _MIN_IMAGES = 4
 _MAX_CAMERAS = 16
@@ -27,14 +25,14 @@ _MAX_GROUPINGS = 8
 _GOOD_COST = 1.0
 _THUMBNAIL_PX = 168
 
-Groups = dict[str, list[Path]]
+Groups = dict[str, list[SourceImage]]
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
     """An image, as far as it is needed to understand it. thumbnail : for people; brightest : sample of the image."""
 
-    path: Path
+    image: SourceImage
     thumbnail: Pixels
     samples: Light
     form: CameraFormat
@@ -57,10 +55,10 @@ class UnderstoodFolder:
         return list(dict.fromkeys(found))
 
     @property
-    def faults(self) -> set[Path]:
+    def faults(self) -> set[SourceImage]:
         """Images that do not show what their place says: copies, and exchanged ones."""
         return {
-            pictures[image].path
+            pictures[image].image
             for pictures, each in self.cameras.values() for doubt in each.doubts if doubt.is_fault
             for image in doubt.images
         }  # fmt: skip
@@ -73,25 +71,14 @@ class UnderstoodFolder:
             found.append(f"camera {name}: {len(pictures)} images")
             found += [f"  {fact}" for fact in each.facts]
         if self.alone:
-            found.append(f"beside the set, left out: {', '.join(each.path.name for each in self.alone)}")
-        return found
-
-    def sample_bits(self) -> dict[str, int]:
-        """Bits of a sample of each camera with 16-bit images that uses only the lower ones."""
-        found = {}
-        for name, (pictures, _) in self.cameras.items():
-            if pictures[0].form.bit_depth > 8:
-                samples = [each.samples.astype(np.uint16) for each in pictures]
-                _, full_scale = sample_format([each.reshape(-1, each.shape[-1]) for each in samples], 65535.0)
-                # Samples in the upper bits of a word stay as they are: reconstruction finds their step.
-                found[name] = max(int(full_scale), *(each.brightest for each in pictures)).bit_length()
+            found.append(f"beside the set, left out: {', '.join(each.image.name for each in self.alone)}")
         return found
 
     @property
-    def assigned(self) -> dict[str, list[tuple[Path, Pattern]]]:
+    def assigned(self) -> dict[str, list[tuple[SourceImage, Pattern]]]:
         """The images of each camera with their patterns."""
         return {
-            name: [(picture.path, shown) for picture, shown in zip(pictures, each.patterns, strict=True) if shown]
+            name: [(picture.image, shown) for picture, shown in zip(pictures, each.patterns, strict=True) if shown]
             for name, (pictures, each) in self.cameras.items()
         }
 
@@ -101,21 +88,21 @@ class UnderstoodFolder:
         return max(each.cost + 0.5 * len(each.left_out) for _, each in self.cameras.values())
 
 
-def list_images(folder: Path) -> list[Path]:
-    """Return the images of a folder in natural order."""
-    files = (each for each in folder.iterdir() if each.suffix.lower() in IMAGES and each.name[0] != ".")
-    return sorted(files, key=natural_sort_key)
-
-
-def list_subfolders(folder: Path) -> Groups:
-    """Return the images of each subfolder, in natural order. Raises BundleError: there are none."""
+def list_subfolders(folder: Path) -> tuple[Groups, list[str]]:
+    """Return the images of each subfolder, in natural order, and how they were found in words.
+    Raises BundleError: there are none.
+    """
     subfolders = sorted(
         (each for each in folder.iterdir() if each.is_dir() and each.name[0] != "."), key=natural_sort_key
     )
-    by_folder = {each.name: files for each in sorted(subfolders, key=natural_sort_key) if (files := list_images(each))}
+    listed = {each.name: list_images(each) for each in subfolders}
+    by_folder = {name: images for name, (images, _) in listed.items() if images}
     if not by_folder:
-        raise BundleError(f"{folder}: expected images ({', '.join(sorted(IMAGES))}), found none in it or below it")
-    return by_folder
+        if (folder / DESCRIPTION).is_file():
+            message = f"{folder}: expected images to import, found a scan bundle; slrig reconstruct reads it"
+            raise BundleError(message)
+        raise BundleError(f"{folder}: expected images ({', '.join(sorted(ENDINGS))}), found none in it or below it")
+    return by_folder, [note for _, notes in listed.values() for note in notes]
 
 
 def camera_name(text: str) -> str:
@@ -123,7 +110,7 @@ def camera_name(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "-", text).strip("_-") or "cam0"
 
 
-def group_by_prefix(images: Sequence[Path]) -> Groups:
+def group_by_prefix(images: Sequence[SourceImage]) -> Groups:
     """Group images by the part of their names before the last number."""
     groups: Groups = {}
     for image in images:
@@ -133,7 +120,7 @@ def group_by_prefix(images: Sequence[Path]) -> Groups:
     return {camera_name(prefix): each for prefix, each in groups.items()}
 
 
-def groupings(images: Sequence[Path]) -> Iterator[Groups]:
+def groupings(images: Sequence[SourceImage]) -> Iterator[Groups]:
     """Yield groups of images by camera that their names may mean: all of one camera; by words; by one of the numbers or
     words that few values of occur; by the part before the last number.
     """
@@ -144,7 +131,7 @@ def groupings(images: Sequence[Path]) -> Iterator[Groups]:
     usual = shapes.most_common(1)[0][0]
     candidates += [[each[k] if len(each) == usual else "" for each in fields] for k in range(usual)]
     candidates.append([re.sub(r"\d+\D*$", "", image.stem) for image in images])
-    found: list[list[list[Path]]] = []
+    found: list[list[list[SourceImage]]] = []
     for keys in candidates:
         counts = Counter(keys)
         if not 1 < len(counts) <= _MAX_CAMERAS or counts.most_common(2)[1][1] < _MIN_IMAGES:
@@ -155,13 +142,13 @@ def groupings(images: Sequence[Path]) -> Iterator[Groups]:
             yield {camera_name(key if not key.isdigit() else f"cam{key}"): each for key, each in groups.items()}
 
 
-def read_picture(path: Path) -> Picture:
+def read_picture(source: SourceImage) -> Picture:
     """Read an image in samples and as a small picture. Raises BundleError: it cannot be read."""
-    form = read_frame_format(path)
-    image = read_with_colour(path, (0,), form)[0][0]
+    form = source.read_format()
+    image, _ = source.read(form)
     scale = _THUMBNAIL_PX / max(image.shape)
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return Picture(path, small, sample_image(image), form, int(image.max()))
+    return Picture(source, small, sample_image(image), form, int(image.max()))
 
 
 def understand_folder(
@@ -175,7 +162,7 @@ def understand_folder(
 
     Raises BundleError: no group of images is understood; the words of the fewest groups.
     """
-    cache: dict[Path, Picture] = {}
+    cache: dict[SourceImage, Picture] = {}
     best: UnderstoodFolder | None = None
     failure: BundleError | None = None
     for number, group in enumerate(groups):
@@ -196,9 +183,9 @@ def understand_folder(
 
 
 def _understand(
-    groups: Mapping[str, Sequence[Path]],
+    groups: Mapping[str, Sequence[SourceImage]],
     projector: Size,
-    cache: dict[Path, Picture],
+    cache: dict[SourceImage, Picture],
     *,
     cell_px: int | None,
     offset_px: int | None,
@@ -221,7 +208,7 @@ def _understand(
                 raise BundleError(f"expected at least {_MIN_IMAGES} images of a camera, found {len(own)}")
             found.alone += own
             continue
-        names = [each.path.name for each in own]
+        names = [each.image.name for each in own]
         understood = understand(
             [each.samples for each in own], projector, names.__getitem__, cell_px=cell_px, offset_px=offset_px
         )
@@ -240,12 +227,12 @@ def contact_sheet(understood: UnderstoodFolder) -> Pixels:
         for index, picture in enumerate(pictures):
             shown = found.patterns[index]
             words = pattern_words(shown) if shown is not None else f"left out: {found.left_out.get(index, 'unknown')}"
-            label = picture.path.name if len(understood.cameras) == 1 else f"{camera}: {picture.path.name}"
+            label = picture.image.name if len(understood.cameras) == 1 else f"{camera}: {picture.image.name}"
             is_red = index in doubtful or shown is None
             tiles.append(_tile(picture.thumbnail, brightest, label, words, is_red=is_red))
     for picture in understood.alone:
         brightest = int(picture.thumbnail.max()) or 1
-        tiles.append(_tile(picture.thumbnail, brightest, picture.path.name, "left out: beside the set", is_red=True))
+        tiles.append(_tile(picture.thumbnail, brightest, picture.image.name, "left out: beside the set", is_red=True))
     columns = min(len(tiles), 8)
     height = max(each.shape[0] for each in tiles)
     tiles = [np.pad(each, ((0, height - each.shape[0]), (0, 0), (0, 0)), constant_values=32) for each in tiles]

@@ -191,7 +191,6 @@ def test_what_does_not_fit_is_refused_in_words(tmp_path: Path) -> None:
     # Samples of 12 bits in files of 16.
     deep = lay_out(tmp_path / "deep", deep_images())
     words = ("--pattern", "white black columns")
-    refused(deep, *words, projector="2x1", says=["--bit-depth 12"])
     refused(deep, *words, "--bit-depth", 8, projector="2x1", says=["samples of 16 bits, found 8"])
     assert not out.exists()
     assert list(tmp_path.glob(".*")) == []
@@ -205,8 +204,10 @@ def deep_images() -> list[Pixels]:
 
 def test_depth_and_colour_are_those_of_the_files(tmp_path: Path) -> None:
     words = ("--pattern", "white black columns")
-    deep = imported(lay_out(tmp_path / "12", deep_images()), tmp_path / "a", *words, "--bit-depth", 12, projector="2x1")
-    assert read_bundle(deep).capture.cameras["cam0"].bit_depth == 12
+    deep = lay_out(tmp_path / "12", deep_images())
+    for name, given in (("a", ("--bit-depth", 14)), ("c", ())):
+        bundle = imported(deep, tmp_path / name, *words, *given, projector="2x1")
+        assert read_bundle(bundle).capture.cameras["cam0"].bit_depth == (14 if given else 12)
     coloured = [np.dstack([each // 16, each // 64, each // 32]).astype(np.uint8) for each in deep_images()]
     bundle = imported(lay_out(tmp_path / "bgr", coloured), tmp_path / "b", *words, projector="2x1")
     shots = read_bundle(bundle).capture.shots

@@ -217,9 +217,9 @@ BAD_FRAMES: dict[str, tuple[Spoil, tuple[str, ...]]] = {
         with_description(lambda data: data["cameras"]["left"].update(bit_depth=7)),
         ("samples of 0 to 127", "found a sample of", "right-align the samples"),
     ),
-    "alpha": (
+    "transparent": (
         with_image("left/000", np.zeros((30, 40, 4), np.uint8)),
-        ("expected a grey or colour PNG", "an alpha channel", "save the frame as grey"),
+        ("frames/left/000.png", "expected an opaque image", "found 1200 transparent pixels", "without alpha"),
     ),
     "another kind": (
         with_frame("left/000", lambda _: b"GIF89a a film"),
@@ -376,6 +376,8 @@ def test_a_description_that_is_not_text_is_refused(folder: Path) -> None:
 def test_a_folder_without_description_is_refused(tmp_path: Path) -> None:
     _fault(tmp_path, "bundle.json", "found a folder without it")
     _fault(tmp_path / "nowhere", "found no such folder", "give the folder that holds it")
+    (tmp_path / "bundle.zip").touch()
+    _fault(tmp_path / "bundle.zip", "found a file", "unpack it (python3 -m zipfile -e", "give the folder that holds it")
 
 
 def test_a_calibration_of_other_cameras_is_refused(folder: Path) -> None:
