@@ -38,6 +38,7 @@ _SURE = 0.5  # mean sign of a bit at the edges of coarser ones
 _TOGETHER = 0.6  # of the edges of coarser bits, at which finer ones change too in a plain binary code
 _TURNED = 0.8  # what a bit counts whose first image is another than those of the others
 _MAX_WEIGHT = 15.0  # root of a number of edges: more are not surer
+_FEW_EDGES, _HALF_LIT = -4.0, 0.22  # log2 per pixel; share of samples, of a pattern that changes smoothly
 _MIN_FACTOR_SHARE = 0.08  # of the lit samples, that tell the light of an image
 _MAX_HIDDEN = 3  # bits that are constant where there is light, or not resolved, at each end of a code
 _MISSING, _EXTRA, _WRONG, _EXCHANGED = 1.3, 1.6, 4.0, 1.8  # costs of an order of images
@@ -150,6 +151,12 @@ class Unit:
     def place(self) -> int:
         """Of the first image in the sequence."""
         return self.images[0]
+
+    @property
+    def is_smooth(self) -> bool:
+        """True if much of the image is half lit between few edges, as by a sinusoid."""
+        half = np.abs(self.swing[0]) < 0.5 * np.percentile(np.abs(self.swing[0]), 95)
+        return self.density < _FEW_EDGES and not self.is_weak and float(half.mean()) > _HALF_LIT
 
 
 @dataclass(slots=True)

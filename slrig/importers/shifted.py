@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -10,14 +10,18 @@ import cv2
 import numpy as np
 
 from slrig.importers.detection import Lit, Looks, Mask, Unit
-from slrig.model import MIN_LINE_STEPS, Axis, FloatArray, LineShift
+from slrig.model import MIN_LINE_STEPS, Axis, FloatArray, LineShift, Sine
 
 _SAME_DENSITY = 0.4  # octaves
 _MAX_SPREAD = 1.5  # octaves, of lines of one period
 _FINE = -5.5  # log2 of edges per pixel: coarser bits may have equally many by chance
-_MAX_STRAY_PX = 0.3  # of a shift from its even place, in steps
-_WINDOW = 5  # samples, over which the position of cells is averaged
+_WINDOW, _MAX_WINDOW, _CELLS = 5, 61, 2.0  # samples and cells, over which the position of cells is averaged
 _MIN_SHARE = 0.75  # of the samples around one, for a mean
+_WHOLE = 0.004  # distance of a period from whole pixels that is none
+_MIN_SINE, _MIN_SINE_PX = 0.8, 10.0  # coherence, period: lines of shorter ones may look like sinusoids
+_FITTING = 0.03  # of a cell, that a whole number of cells differs from a period
+_MAX_THIRD = 0.1  # of the first harmonic, at a third of the period
+_MAX_STRAY = 0.35  # of a step
 _MIN_COHERENCE = 0.2
 
 
@@ -61,7 +65,7 @@ class ShiftedLines:
     """
 
     axis: Axis
-    patterns: dict[int, LineShift]
+    patterns: Mapping[int, LineShift | Sine]
     coherence: float
     is_reversed: bool
     stray_px: float
@@ -76,7 +80,13 @@ def position_map(lit: Lit, index: FloatArray, sure: Mask, width: int) -> FloatAr
     kept = lit.slots[sure]
     grid[kept], weight[kept] = index[sure], 1.0
     grid, weight = grid.reshape(height, width), weight.reshape(height, width)
-    size = (_WINDOW, _WINDOW)
+    both = (weight[:, 1:] > 0) & (weight[:, :-1] > 0)
+    across = np.abs(np.diff(grid, axis=1))[both]
+    down = np.abs(np.diff(grid, axis=0))[(weight[1:] > 0) & (weight[:-1] > 0)]
+    cells = max(float(np.mean(np.minimum(each, 3))) if each.size else 0.0 for each in (across, down))
+    # A mean over several cells is finer than one of them.
+    side = 2 * int(np.clip(_CELLS / max(cells, 1e-3), _WINDOW, _MAX_WINDOW) / 2) + 1
+    size = (side, side)
     share = cv2.blur(weight, size, borderType=cv2.BORDER_CONSTANT)
     mean = cv2.blur(grid * weight, size, borderType=cv2.BORDER_CONSTANT) / np.maximum(share, 1e-6)
     high = cv2.dilate(np.where(weight > 0, grid, -1e9), np.ones(size, np.uint8))
@@ -87,12 +97,13 @@ def position_map(lit: Lit, index: FloatArray, sure: Mask, width: int) -> FloatAr
 
 
 def find_lines(
-    lit: Lit, images: Sequence[int], axis: Axis, position_px: FloatArray, extent_px: int
+    lit: Lit, images: Sequence[int], axis: Axis, position_px: FloatArray, extent_px: int, *, cell_px: int
 ) -> ShiftedLines | None:
-    """Find period, width and shift of lines in images, in their order, by the position of each sample; None if they are
-    no shifted lines.
+    """Find period, width and shift of lines or sinusoids in images, in their order, by the position of each sample;
+    None if they are neither.
 
-    position_px : (k,) of the samples, as columns or rows count; NaN where it is unknown.
+    position_px : (k,) of the samples, as columns or rows count; NaN where it is unknown. cell_px : of the
+    code.
     """
     known = np.isfinite(position_px)
     if np.count_nonzero(known) < 200 or len(images) < MIN_LINE_STEPS:
@@ -101,6 +112,9 @@ def find_lines(
     light = lit.light[list(images), 0][:, known].astype(np.float64)
     light = light - light.mean(axis=1, keepdims=True)
     count = len(images)
+    sine = _find_sine(lit, images, axis, place, light, cell_px=cell_px)
+    if sine is not None:
+        return sine
     best: tuple[float, int, FloatArray] | None = None
     for period in range(max(4, count), min(8 * count, extent_px // 2) + 1):
         if period % count:
@@ -133,6 +147,45 @@ def find_lines(
     stray_px = float(_apart(centre, shift + (width - 1) / 2, period).max())
     patterns = {image: LineShift(axis, int(s), period, width) for image, s in zip(images, shift, strict=True)}
     return ShiftedLines(axis, patterns, coherence, is_reversed, stray_px)
+
+
+def _find_sine(
+    lit: Lit, images: Sequence[int], axis: Axis, place: FloatArray, light: FloatArray, *, cell_px: int
+) -> ShiftedLines | None:
+    """Return sinusoids: half of the light, and less of the third harmonic than lines have that a camera resolves."""
+    count, span = len(images), float(np.ptp(place))
+    frequencies = np.arange(1 / span, 1 / _MIN_SINE_PX, 0.2 / span)
+    thin = slice(None, None, max(1, len(place) // 4000))
+    coherence = [_fit_wave(light[:, thin], place[thin], 1 / each)[1] for each in frequencies]
+    best = frequencies[int(np.argmax(coherence))]
+    finer = best + np.linspace(-0.2, 0.2, 41) / span
+    finer = finer[finer > 0]
+    period = 1 / finer[int(np.argmax([_fit_wave(light[:, thin], place[thin], 1 / each)[1] for each in finer]))]
+    # Positions between the edges of wide cells are less certain than that periods and cells fit each other.
+    whole = cell_px * round(period / cell_px)
+    if whole and abs(period - whole) < max(_WHOLE * period, _FITTING * cell_px):
+        period = float(whole)
+    elif abs(period - round(period)) < _WHOLE * period:
+        period = float(round(period))
+    wave, fits = _fit_wave(light, place, period)
+    third = float(np.median(np.abs(_fit_wave(light, place, period / 3)[0]) / np.maximum(np.abs(wave), 1e-9)))
+    share = float(np.mean(lit.light[list(images), 0].clip(0, 1)))
+    if fits < _MIN_SINE or period < _MIN_SINE_PX or third > _MAX_THIRD or not 0.25 < share < 0.75:
+        return None
+    centre = (np.angle(wave) / (2 * np.pi)) % 1
+    turns = np.array([((b - a) * count + count / 2) % count - count / 2 for a, b in pairwise(centre)])
+    if np.abs(np.abs(turns) - 1).max() > _MAX_STRAY:
+        return None
+    # A program may begin with a sine or a cosine: a quarter of a period is a step of twice or four times as many.
+    for steps in (count, 2 * count, 4 * count):
+        stray = _apart(centre * steps, np.rint(centre * steps), steps)
+        if stray.max() < _MAX_STRAY * steps / (4 * count) or steps == 4 * count:
+            break
+    shifts = np.rint(centre * steps).astype(int) % steps
+    if len(set(shifts.tolist())) < count:
+        return None
+    patterns = {image: Sine(axis, float(period), int(each), steps) for image, each in zip(images, shifts, strict=True)}
+    return ShiftedLines(axis, patterns, fits, bool(np.median(turns) < 0), float(stray.max() * period / steps))
 
 
 def _fit_wave(light: FloatArray, place: FloatArray, period: float) -> tuple[FloatArray, float]:

@@ -29,7 +29,7 @@ from slrig.importers.detection import (
     replace_units,
 )
 from slrig.importers.shifted import ShiftedLines, find_lines, position_map, shifted_units
-from slrig.model import Axis, Black, Gray, LineShift, Pattern, Size, White
+from slrig.model import Axis, Black, Gray, LineShift, Pattern, Sine, Size, White
 from slrig.patterns import gray_bits
 
 Names = Callable[[int], str]
@@ -94,7 +94,8 @@ def understand(
     shifted = {image for group in groups for unit in group for image in unit.images}
     code = replace_units(looks, [unit for unit in looks.units if unit.images[0] not in shifted])
     chains, direct_first, pairs = _chains(code)
-    if not chains:
+    smooth = [unit for unit in code.units if unit.is_smooth]
+    if not chains or 2 * len(smooth) > sum(len(chain.units) for chain in chains.values()):
         raise BundleError(_nothing_found(looks, len(samples)))
     for axis, chain in chains.items():
         if chain.is_binary:
@@ -228,7 +229,8 @@ def _pattern(shown: CodeBit | str | None, places: Mapping[Axis, CodePlace]) -> P
 def _line_images(group: Sequence[Unit], looks: Looks) -> list[int]:
     """Images of a group of shifted patterns; one of them may show the same as a bit of the code."""
     own = [image for unit in group for image in unit.images]
-    return sorted([*own, *(copy for copy in looks.copies if min(own) - 1 <= copy <= max(own) + 1)])
+    near = range(min(own) - 1, max(own) + 2)
+    return sorted([*own, *(copy for copy, first in looks.copies.items() if copy in near and first not in own)])
 
 
 def _lines(
@@ -253,23 +255,25 @@ def _lines(
         cells = (1 << place.bits >> unresolved) - 1 - cells
     position = position_map(lit, cells, sure, width) * (place.cell_px << unresolved) - 0.5 - place.offset_px
     images = _line_images(group, looks)
-    return find_lines(lit, images, axis, position, projector.along(axis))
+    return find_lines(lit, images, axis, position, projector.along(axis), cell_px=place.cell_px)
 
 
 def _describe_lines(found: Understanding, lines: ShiftedLines, name: Names) -> None:
     images = list(lines.patterns)
     one = next(iter(lines.patterns.values()))
-    found.facts.append(
-        f"{len(images)} shifted lines of {lines.axis}s, {one.line_width_px} px wide, every {one.period_px} px: "
-        f"{name(images[0])} to {name(images[-1])}"
+    what = (
+        f"sinusoids of {lines.axis}s, {one.steps} steps of a period of {one.period_px:.5g} px"
+        if isinstance(one, Sine)
+        else f"shifted lines of {lines.axis}s, {one.line_width_px} px wide, every {one.period_px} px"
     )
+    found.facts.append(f"{len(images)} {what}: {name(images[0])} to {name(images[-1])}")
     if lines.is_reversed:
         text = (
             f"the lines of {lines.axis}s run against the code: either the lines are shifted backward, or the first bit "
             "of the code is inverted, so that it is mirrored"
         )
         found.doubts.append(Doubt(text, tuple(images)))
-    if lines.stray_px > 0.35:
+    if lines.stray_px > max(0.35, 0.03 * one.period_px):
         text = f"the lines of {lines.axis}s are up to {lines.stray_px:.1f} px from their even places in the code"
         found.doubts.append(Doubt(text, tuple(images)))
 
@@ -359,7 +363,7 @@ def _doubt(
         elif signed < -0.5 and len(reading.places) == 1:
             side = "right to left" if axis is Axis.COLUMN else "bottom to top"
             doubts.append(Doubt(f"{axis}s run from {side} in the image: a camera upside down, or a mirrored code"))
-        has_lines = any(isinstance(each, LineShift) and each.axis is axis for each in found.patterns)
+        has_lines = any(isinstance(each, LineShift | Sine) and each.axis is axis for each in found.patterns)
         whole = gray_bits(projector.along(axis), 1, 0)
         if place.bits < whole - 1 and not has_lines and hint is None:
             reach = 1 << place.bits
@@ -399,10 +403,12 @@ def _listed(images: Sequence[int], name: Names) -> str:
 
 def _nothing_found(looks: Looks, count: int) -> str:
     pairs = sum(len(unit.images) == 2 for unit in looks.units)
+    smooth = sum(len(unit.images) for unit in looks.units if unit.is_smooth)
+    found = f"{smooth} images change smoothly, as phase shifts of several periods do" if smooth else "no Gray code"
     return (
         f"found {count} images, {len(looks.flat)} of them with the same light everywhere, {pairs} pairs of a pattern "
-        "and its inverse, and no Gray code: expected bits of stripes, each twice as fine as the one before; these may "
-        "be phase shifts without a code, or images of several captures"
+        f"and its inverse: {found}; expected bits of stripes, each twice as fine as the one before, and with them "
+        "lines or sinusoids of one period; list others by --list, as 'column sine 0 of 4 period 18.5'"
     )
 
 

@@ -11,7 +11,7 @@ import pytest
 from slrig.errors import BundleError
 from slrig.importers.detection import sample_image
 from slrig.importers.understanding import Understanding, understand
-from slrig.model import Axis, Black, FloatArray, Gray, LineShift, Pattern, Pixels, Size, White
+from slrig.model import Axis, Black, FloatArray, Gray, LineShift, Pattern, Pixels, Sine, Size, White
 from tests.rendered_folders import pattern_light
 
 PROJECTOR = Size(200, 150)
@@ -120,6 +120,18 @@ def test_a_code_with_an_inverted_first_bit_is_mirrored(rest: list[Pattern]) -> N
     found = understood(photographed(wrong))
     assert found.patterns == wrong
     assert any("the code of columns is mirrored" in doubt.text for doubt in found.doubts)
+
+
+@pytest.mark.parametrize(("cell", "period", "steps"), [(16, 16.0, 4), (16, 16.0, 3), (8, 32.0, 8)])
+def test_sinusoids_beside_a_code_are_named(cell: int, period: float, steps: int) -> None:
+    shown = [*ENDS, *bits(Axis.COLUMN, cell=cell), *(Sine(Axis.COLUMN, period, k, steps) for k in range(steps))]
+    assert understood(photographed(shown)).patterns == shown
+
+
+def test_phase_shifts_without_a_code_are_refused_by_name() -> None:
+    periods = [*ENDS, *(Sine(Axis.COLUMN, period, k, 4) for period in (200.0, 50.0, 12.5) for k in range(4))]
+    with pytest.raises(BundleError, match="8 images change smoothly, as phase shifts of several periods do"):
+        understood(photographed(periods))
 
 
 def test_too_few_bits_for_the_projector_are_said() -> None:
