@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -44,7 +45,7 @@ def test_sinusoids_measure_a_rendered_ball(
         acquisition.capture_frames(
             rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False
         ).finish()
-    report = reconstruct_bundle(
+    report: dict[str, Any] = reconstruct_bundle(
         tmp_path / "bundle", tmp_path / "mesh", plan=ReconstructionPlan(), progress=lambda *_: None,
         cancelled=lambda: False,
     )  # fmt: skip
