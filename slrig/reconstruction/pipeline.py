@@ -87,6 +87,8 @@ _REACH_PX = 16  # of the widest filter, 9 px, and of a point's offset from its p
 _MIN_SAMPLED_POINTS = 4_000  # of a frame: their median is known to a thirtieth of their scatter
 _BAND_ROWS, _MAX_BAND_SPACING = 8, 16  # rows of a sampled band; a band in so many at least
 _MIN_FILTER_ONLY_PX = 2.0  # a filter so wide sums more pixels than the fit to the phase, and has less noise
+# Long periods in little light scatter: of a dark surface, points of 1 px are most of what there is, and σ says so.
+_SINUSOID_POINTS = {"start_sigma_px": np.inf, "coarsest_px": 1.0}
 _MIN_SMOOTHED_PX = 1.4  # stripe and filter together: see `_matched_scale_px`
 
 
@@ -377,7 +379,7 @@ def align_points(
         refinement = refine_points(
             found, measured, usable, code, tables.position_table, step_px, extra_sigma_px=extra_sigma_px,
             max_disagreement_px=limits.max_disagreement_px, sampled=sampled, release_lines=release_lines,
-            **({} if image.sinusoids is None else {"start_sigma_px": np.inf}),
+            **({} if image.sinusoids is None else _SINUSOID_POINTS),
         )  # fmt: skip
         points, disagreement_px, frame_sigma_px = (
             refinement.points, refinement.disagreement_px, refinement.frame_sigma_px

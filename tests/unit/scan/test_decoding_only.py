@@ -116,7 +116,7 @@ def test_frames_without_a_code_are_refused(tmp_path: Path) -> None:
     shots = tuple(replace(s, pattern=kept.index(s.pattern)) for s in capture.shots if s.pattern in kept)
     bare = Capture(capture.projector, tuple(capture.patterns[index] for index in kept), capture.cameras, shots)
     write_bundle(tmp_path / "bundle", bare, None)
-    with pytest.raises(PatternError, match="no Gray-code"):
+    with pytest.raises(PatternError, match="no frames of Gray code or sinusoids"):
         decode_bundle(tmp_path / "bundle", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
