@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import combinations
 
 import numpy as np
 
@@ -43,6 +44,8 @@ _MIN_TRIED = 3  # sets of frames that are enlarged
 _LEFT_FRACTION, _MAX_LEFT_FRACTION = 0.15, 0.3  # of the mean square, without the frames that are wrong
 _CLEARLY_OFF, _MAX_LEFT_IN_SCENE = 4.0, 0.6
 _MAX_FIRST_FRACTION = 0.75  # the same, without one of several that are wrong
+_MAX_PROVING_JUMPS, _MANY_JUMPS = 0.1, 0.3  # the same
+_LEFT_JUMPS = 0.25  # of those before
 _MIN_JUMPS = 0.02  # of the adjacent pixels
 _LIGHT_STEPS, _MIN_FITTED_CHANGE = 5, 0.06
 _BRIGHT = 0.5  # of the most light of a frame, where its factor is measured
@@ -143,9 +146,33 @@ def check_agreement(frames: Light, model: LightModel, band: Integers) -> FrameAg
     if fit.misfit(everywhere) > (_MAX_MISFIT_OF_A_SCENE + _MAX_MISFIT_SIGMAS * fit.noise) ** 2:
         sines = tuple(place for places in model.groups for place in places)
         return FrameAgreement(none, everywhere, suspects=tuple(sorted(sines)))
-    if misfits.max() > (_MAX_PROVING_MISFIT + _MAX_MISFIT_SIGMAS * fit.noise) ** 2:
+    exchanged = _find_exchange(frames, model) if fit.jumps > _MANY_JUMPS else ()
+    if exchanged:
+        return FrameAgreement(none, everywhere, exchanged, shows=dict(zip(exchanged, exchanged[::-1], strict=True)))
+    if fit.jumps > _MAX_PROVING_JUMPS or misfits.max() > (_MAX_PROVING_MISFIT + _MAX_MISFIT_SIGMAS * fit.noise) ** 2:
         return FrameAgreement(none, everywhere)
     return FrameAgreement(model.provable() & (fit.shape.std(axis=1) > _MIN_DEVIATION), everywhere)
+
+
+def _find_exchange(frames: Light, model: LightModel) -> tuple[int, ...]:
+    """Return the two frames of a period that make the position continuous if they are exchanged back; empty if none do.
+
+    Few frames fit some position in any order, which then jumps from pixel to pixel.
+    """
+    few = _some_pairs(frames, _SEARCH_PAIRS)
+    before, everywhere = fit_frames(few, model), np.ones(few.shape[1], dtype=np.bool_)
+    found: list[tuple[float, tuple[int, ...]]] = []
+    for one, other in (pair for group in model.groups for pair in combinations(group, 2)):
+        order = np.arange(len(few))
+        order[[one, other]] = other, one
+        fit = fit_frames(few[order], model)
+        if fit.misfit(everywhere) < max(fit.limit**2, before.misfit(everywhere)):
+            found.append((fit.jumps, (one, other)))
+    found.sort()
+    if not found or found[0][0] > _LEFT_JUMPS * before.jumps:
+        return ()
+    is_only = len(found) == 1 or found[1][0] > found[0][0] + _LEFT_JUMPS * before.jumps
+    return found[0][1] if is_only else ()
 
 
 def _find_lights(frames: Light, model: LightModel, fit: FrameFit, band: Integers) -> tuple[FrameLight, ...]:
