@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import combinations
 
 import numpy as np
 
@@ -41,7 +42,10 @@ _MAX_FRAME_MISFIT = 1.5  # times the limit, of one frame
 _MAX_WRONG = 3  # frames; more are no fault of single ones
 _MIN_TRIED = 3  # sets of frames that are enlarged
 _LEFT_FRACTION, _MAX_LEFT_FRACTION = 0.15, 0.3  # of the mean square, without the frames that are wrong
+_CLEARLY_OFF, _MAX_LEFT_IN_SCENE = 4.0, 0.6
 _MAX_FIRST_FRACTION = 0.75  # the same, without one of several that are wrong
+_MAX_PROVING_JUMPS, _MANY_JUMPS = 0.1, 0.3  # the same
+_LEFT_JUMPS = 0.25  # of those before
 _MIN_JUMPS = 0.02  # of the adjacent pixels
 _LIGHT_STEPS, _MIN_FITTED_CHANGE = 5, 0.06
 _BRIGHT = 0.5  # of the most light of a frame, where its factor is measured
@@ -72,6 +76,15 @@ class FrameFit:
     level: Samples
     swing: Samples
     jumps: float
+
+    def off(self, place: int) -> float:
+        """Return the root mean square of what does not fit of a frame."""
+        return float(np.sqrt(np.mean(self.rest[place] ** 2)))
+
+    @property
+    def limit(self) -> float:
+        """Root mean square of what does not fit of right frames in any but a difficult scene."""
+        return float(np.hypot(_MAX_MISFIT, _MAX_MISFIT_SIGMAS * self.noise))
 
     def misfit(self, where: SampleMask) -> float:
         """Return the mean square of what does not fit, of the frames that were fitted, for each equation to spare."""
@@ -111,7 +124,7 @@ def check_agreement(frames: Light, model: LightModel, band: Integers) -> FrameAg
     opposite = opposite_groups(frames, model)
     if opposite:
         return FrameAgreement(none, everywhere, suspects=opposite, opposite=True)
-    limit = _MAX_MISFIT + _MAX_MISFIT_SIGMAS * fit.noise
+    limit = fit.limit
     misfits = np.array([fit.misfit(band == each) if np.any(band == each) else 0.0 for each in range(BANDS)])
     where = np.isin(band, np.flatnonzero(misfits > limit**2))
     if np.sqrt(np.mean(fit.rest**2, axis=1)).max() > _MAX_FRAME_MISFIT * limit and not where.any():
@@ -133,9 +146,33 @@ def check_agreement(frames: Light, model: LightModel, band: Integers) -> FrameAg
     if fit.misfit(everywhere) > (_MAX_MISFIT_OF_A_SCENE + _MAX_MISFIT_SIGMAS * fit.noise) ** 2:
         sines = tuple(place for places in model.groups for place in places)
         return FrameAgreement(none, everywhere, suspects=tuple(sorted(sines)))
-    if misfits.max() > (_MAX_PROVING_MISFIT + _MAX_MISFIT_SIGMAS * fit.noise) ** 2:
+    exchanged = _find_exchange(frames, model) if fit.jumps > _MANY_JUMPS else ()
+    if exchanged:
+        return FrameAgreement(none, everywhere, exchanged, shows=dict(zip(exchanged, exchanged[::-1], strict=True)))
+    if fit.jumps > _MAX_PROVING_JUMPS or misfits.max() > (_MAX_PROVING_MISFIT + _MAX_MISFIT_SIGMAS * fit.noise) ** 2:
         return FrameAgreement(none, everywhere)
     return FrameAgreement(model.provable() & (fit.shape.std(axis=1) > _MIN_DEVIATION), everywhere)
+
+
+def _find_exchange(frames: Light, model: LightModel) -> tuple[int, ...]:
+    """Return the two frames of a period that make the position continuous if they are exchanged back; empty if none do.
+
+    Few frames fit some position in any order, which then jumps from pixel to pixel.
+    """
+    few = _some_pairs(frames, _SEARCH_PAIRS)
+    before, everywhere = fit_frames(few, model), np.ones(few.shape[1], dtype=np.bool_)
+    found: list[tuple[float, tuple[int, ...]]] = []
+    for one, other in (pair for group in model.groups for pair in combinations(group, 2)):
+        order = np.arange(len(few))
+        order[[one, other]] = other, one
+        fit = fit_frames(few[order], model)
+        if fit.misfit(everywhere) < max(fit.limit**2, before.misfit(everywhere)):
+            found.append((fit.jumps, (one, other)))
+    found.sort()
+    if not found or found[0][0] > _LEFT_JUMPS * before.jumps:
+        return ()
+    is_only = len(found) == 1 or found[1][0] > found[0][0] + _LEFT_JUMPS * before.jumps
+    return found[0][1] if is_only else ()
 
 
 def _find_lights(frames: Light, model: LightModel, fit: FrameFit, band: Integers) -> tuple[FrameLight, ...]:
@@ -153,7 +190,7 @@ def _find_lights(frames: Light, model: LightModel, fit: FrameFit, band: Integers
             if not np.all((factors > 1 / MAX_LIGHT_FACTOR) & (factors < MAX_LIGHT_FACTOR)):
                 break
             again = fit_frames(base + (frames - base) / factors[:, np.newaxis], model)
-        limit = _MAX_MISFIT + _MAX_MISFIT_SIGMAS * again.noise
+        limit = again.limit
         after = max(again.misfit(band == each) for each in np.unique(band))
         doubtful = is_sine & (np.abs(factors - 1) > STEADY_LIGHT) & (again.shape.std(axis=1) < _MIN_LIT_DEVIATION)
         if after < min(limit**2, best) and not doubtful.any():
@@ -165,8 +202,10 @@ def _factors(frames: Light, model: LightModel, fit: FrameFit, *, is_exposure: bo
     """(K,) float32: light of each frame relative to white, or to the median without white, where it is bright."""
     base = np.float32(0) if is_exposure else fit.level
     predicted = np.maximum(fit.level + fit.swing * fit.shape - base, 1e-3)
-    bright = fit.shape >= _BRIGHT * fit.shape.max(axis=1, keepdims=True)
-    ratio = np.where(bright, (frames - base) / predicted, np.nan)
+    most = fit.shape.max(axis=1, keepdims=True)
+    ratio = np.where(fit.shape >= _BRIGHT * most, (frames - base) / predicted, np.nan)
+    # A frame that is dark wherever the camera looks has no measurable factor.
+    ratio[most[:, 0] < _MIN_DEVIATION] = 1
     factors = np.nanmedian(ratio, axis=1)
     white = [place for place, pattern in enumerate(model.patterns) if isinstance(pattern, White)]
     factors /= factors[white[0]] if white else np.median(factors)
@@ -194,9 +233,12 @@ def _find_wrong(
         left, places, fit = tried[0]
         if left > _MAX_FIRST_FRACTION * before:
             break
-        if left > min(max(_LEFT_FRACTION * before, limit**2), _MAX_LEFT_FRACTION * before):
-            continue
-        if not all(_is_off(fit, place) for place in places):
+        fits = left < min(max(_LEFT_FRACTION * before, limit**2), _MAX_LEFT_FRACTION * before)
+        # Where the scene leaves much, a sinusoid may stand out; without a bit, another position fits.
+        clear, sines = _CLEARLY_OFF * max(left**0.5, limit), {place for group in model.groups for place in group}
+        stands_out = left < _MAX_LEFT_IN_SCENE * before and sines.issuperset(places)
+        stands_out = stands_out and all(fit.off(place) > clear for place in places)
+        if not (fits or stands_out) or not all(_is_off(fit, place) for place in places):
             continue
         close = [each for each in tried if each[0] < _MIN_AHEAD * left]
         # Of several that fit, the position is continuous without those that are wrong.
@@ -248,7 +290,7 @@ def _are_opposite(one: Samples, other: Samples) -> bool:
 def order_misfit(frames: Light, model: LightModel) -> tuple[float, float]:
     """Return the mean square of what does not fit, and its limit for frames in the right order."""
     fit = fit_frames(_some_pairs(frames, _ORDER_PAIRS), model)
-    limit = _MAX_MISFIT + _MAX_MISFIT_SIGMAS * fit.noise
+    limit = fit.limit
     return fit.misfit(np.ones(fit.rest.shape[1], dtype=np.bool_)), limit**2
 
 
@@ -261,8 +303,7 @@ def _some_pairs(frames: Light, count: int) -> Light:
 
 def _is_off(fit: FrameFit, place: int) -> bool:
     """True if a frame differs from what the others predict by more than noise and blur explain."""
-    off = float(np.sqrt(np.mean(fit.rest[place] ** 2)))
-    return off > _MIN_OFF * float(fit.shape[place].std()) + 2 * fit.noise
+    return fit.off(place) > _MIN_OFF * float(fit.shape[place].std()) + 2 * fit.noise
 
 
 def _shown(fit: FrameFit, places: Sequence[int]) -> dict[int, int]:

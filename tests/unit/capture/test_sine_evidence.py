@@ -147,6 +147,14 @@ def test_a_period_that_runs_backwards_contradicts_the_other() -> None:
     assert re.search(r"run opposite|exchanged", fault)
 
 
+@pytest.mark.parametrize(("one", "other"), [(2, 3), (2, 4)])
+def test_exchanged_frames_that_fit_other_positions_are_found_by_their_jumps(one: int, other: int) -> None:
+    patterns = SEQUENCES["micro"]
+    frames = images(patterns)
+    frames[one], frames[other] = frames[other], frames[one]
+    assert summary(patterns, frames).wrong == {"left": frozenset({one, other})}
+
+
 def test_a_wrong_frame_is_found_as_soon_as_its_period_is_complete() -> None:
     patterns = SEQUENCES["three periods of four"]
     frames = images(patterns)
