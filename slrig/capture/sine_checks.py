@@ -220,7 +220,7 @@ def _find_wrong(
     frames = _some_pairs(frames, _SEARCH_PAIRS)
     count, everywhere = len(frames), np.ones(frames.shape[1], dtype=np.bool_)
     tried: list[tuple[float, tuple[int, ...], FrameFit]] = []
-    for _ in range(min(_MAX_WRONG, count - 2 - MIN_SPARE_FRAMES)):
+    for _ in range(min(_MAX_WRONG, count - 3 - MIN_SPARE_FRAMES)):
         larger: dict[tuple[int, ...], tuple[float, FrameFit]] = {}
         for places in [places for _, places, _ in tried[:_MIN_TRIED]] or [()]:
             for place in range(count):
