@@ -141,7 +141,7 @@ def _propose(found: UnderstoodFolder, sheet: Path, *, yes: bool) -> None:
     for fact in found.facts:
         typer.echo(f"{'found':<11}{fact}")
     for doubt in found.doubts:
-        typer.echo(f"{'doubtful':<11}{doubt}")
+        typer.echo(f"{'unsure':<11}{doubt}")
     typer.echo(f"{'look at':<11}{sheet}")
     if yes:
         return
@@ -150,7 +150,7 @@ def _propose(found: UnderstoodFolder, sheet: Path, *, yes: bool) -> None:
             raise typer.Exit(1)
     elif found.doubts:
         message = (
-            f"what the images show is doubtful: {'; '.join(found.doubts)}. Look at {sheet}; if it is right, add --yes; "
-            "otherwise describe the images by --format, --pattern, --names or --list"
+            f"it is unsure what the images show: {'; '.join(found.doubts)}. Look at {sheet}; if it is right, add "
+            "--yes; otherwise describe the images by --format, --pattern, --names or --list"
         )
         raise ConfigError(message)
