@@ -27,7 +27,7 @@ def import_images(
     output: Annotated[Path, typer.Option(help="The bundle to write: a new folder.")],
     projector: Annotated[str, typer.Option(help="Columns x rows of the projector, as 1024x768.")],
     program: Annotated[
-        Literal["opencv", "scan3d", "slstudio"] | None,
+        Literal["opencv", "scan3d", "slstudio", "slstudio-micro"] | None,
         typer.Option("--format", help="The program whose order numbered images have. Default: opencv."),
     ] = None,
     pattern: Annotated[
@@ -35,7 +35,7 @@ def import_images(
         typer.Option(
             metavar="WORDS",
             help="Order of numbered images: white, black, columns, rows (each bit with its inverse, the most "
-            "significant first), columns-plain, rows-plain (without inverses).",
+            "significant first), columns-plain, rows-plain (without inverses), columns-sine:PERIOD/STEPS.",
         ),
     ] = None,
     names: Annotated[
@@ -99,7 +99,7 @@ def import_images(
     if len(asked) > 1 or ((white or black) and names is None):
         message = f"expected one of {', '.join(ways)}, and --white and --black with --names, found {', '.join(asked)}"
         raise ConfigError(message)
-    if program in ("scan3d", "slstudio") and (cell_px, offset_px) != (None, None):
+    if program is not None and program != "opencv" and (cell_px, offset_px) != (None, None):
         message = (
             f"--format {program}: expected no --cell-px and --offset-px, which its order says itself; say --pattern"
         )

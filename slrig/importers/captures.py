@@ -40,6 +40,7 @@ from slrig.importers.orders import (
     pattern_from_name,
     pattern_words,
     scan3d_sequence,
+    slstudio_micro_sequence,
     slstudio_sequence,
 )
 from slrig.model import Axis, Black, CameraFormat, Gray, LengthUnit, Pattern, Pixels, Shot, Size, White
@@ -245,7 +246,8 @@ def _pattern_sequence(code: ProjectorCode, naming: ImageNaming, files: Sequence[
         with suppress(BundleError):
             return opencv_sequence(code, count, (White(), Black()), references_first=False)
         return opencv_sequence(code, count, (), references_first=False)
-    return (scan3d_sequence if naming.program == "scan3d" else slstudio_sequence)(code, count)
+    orders = {"scan3d": scan3d_sequence, "slstudio": slstudio_sequence, "slstudio-micro": slstudio_micro_sequence}
+    return orders[naming.program or "opencv"](code, count)
 
 
 def _assign_by_names(folder: Path, code: ProjectorCode, naming: ImageNaming) -> ImageAssignment:
@@ -411,7 +413,7 @@ def _write_camera(
         if not _first_is_brighter(lit, dark):
             raise BundleError(
                 f"{white.place}: expected white, and {black.name} black, found it not brighter wherever they differ; "
-                "correct the order. These may be phase shifts, not supported: slrig reads Gray codes and shifted lines"
+                "correct the order. These may be phase shifts: describe them by --list or --pattern"
             )
     return summary.faults
 

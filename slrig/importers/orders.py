@@ -13,6 +13,10 @@ from slrig.patterns import encode, gray_bits
 
 SLSTUDIO_BITS = {Axis.COLUMN: 10, Axis.ROW: 6}
 """Number of first bits that SLStudio shows on any projector."""
+SLSTUDIO_PERIODS, SLSTUDIO_STEPS = 16, 3
+"""Of its phase shift 2x3: periods over the columns, and shifts of each."""
+SLSTUDIO_MICRO_PERIODS_PX = (75.02, 70.0, 71.32, 72.47, 73.72, 76.23, 77.35, 78.4, 79.22, 80.0)
+"""Of its micro phase shift; the first is shown in three shifts."""
 
 _AXES = {word: axis for axis in Axis for word in (axis.value, f"{axis.value}s", axis.value[:3])} | {
     "x": Axis.COLUMN,
@@ -26,6 +30,7 @@ _CODE = re.compile(
     r"(\w+) (\d{1,3})(?: of (\d{1,2}))?(?: cell (\d{1,5}))?(?: offset (\d{1,5}))?(?: (?!of|cell|offset)(\w+))?"
 )
 _LINE = re.compile(r"(\w+) line (\d{1,4}) of (\d{1,4})(?: width (\d{1,4}))?")
+_SINES = re.compile(r"(columns|rows)-sine:(\d{1,5}(?:\.\d{1,6})?)/(-?\d{1,3})")
 _SINE = re.compile(r"(\w+) sine (\d{1,3}) of (\d{1,3}) period (\d{1,5}(?:\.\d{1,6})?)")
 _FIELDS = {
     "camera": r"[A-Za-z0-9_-]+?",
@@ -39,7 +44,8 @@ _FIELD = re.compile(r"\{(\w*)(?::0?(\d))?\}")
 _UNSUPPORTED = {
     "xor": "codes combined with a base pattern (XOR-02 and others) are not supported: slrig measures edges of light in "
     "the images, which such a code does not have after separation",
-    "phase": "phase shifts are not supported: slrig measures edges of Gray codes and shifted lines",
+    "phase": "phase shifts are described by --list FILE (`column sine 0 of 4 period 16`) or by --pattern "
+    "(`columns-sine:16/4`)",
 }
 _UNSUPPORTED |= dict.fromkeys(("phases", "sine", "sinus", "cos", "fringe", "fringes", "shift"), _UNSUPPORTED["phase"])
 
@@ -107,8 +113,11 @@ class ProjectorCode:
             elif name in ("columns", "rows") and suffix in ("", "plain"):
                 axis = _AXES[name]
                 patterns += self.first_bits(axis, self.bits(axis), inverses=not suffix)
+            elif sines := _SINES.fullmatch(word):
+                patterns += _shifted_sines(_AXES[sines[1]], float(sines[2]), int(sines[3]))
             else:
-                _reject_word(word, "white, black, columns, rows, columns-plain and rows-plain")
+                known = "white, black, columns, rows, columns-plain, rows-plain and columns-sine:PERIOD/STEPS"
+                _reject_word(word, known)
         if not patterns:
             raise BundleError("--pattern: expected white, black, columns or rows, found nothing")
         encode(patterns, self.size)
@@ -154,14 +163,39 @@ def scan3d_sequence(code: ProjectorCode, images: int) -> list[Pattern]:
     return [White(), Black(), *middle]
 
 
+def _shifted_sines(axis: Axis, period_px: float, steps: int) -> list[Pattern]:
+    """Return one frame of each shift; of the opposite direction if steps is negative."""
+    count = abs(steps)
+    return [Sine(axis, period_px, k if steps > 0 else -k % count, count) for k in range(count)]
+
+
+def slstudio_micro_sequence(_code: ProjectorCode, images: int) -> list[Pattern]:
+    """Return the sinusoids of SLStudio's micro phase shift of columns. Raises BundleError: another number of images."""
+    first, *others = SLSTUDIO_MICRO_PERIODS_PX
+    patterns = _shifted_sines(Axis.COLUMN, first, -3)
+    patterns += [Sine(Axis.COLUMN, period_px, 1 - index % 2, 2) for index, period_px in enumerate(others)]
+    if images != len(patterns):
+        raise BundleError(f"expected {len(patterns)} images of SLStudio's micro phase shift, found {images}")
+    return patterns
+
+
 def slstudio_sequence(code: ProjectorCode, images: int) -> list[Pattern]:
-    """Return white, black, then the first bits of columns, rows, or both, without inverses. Raises BundleError."""
+    """Return white, black, then the first bits of columns, rows, or both, without inverses; or for six images three
+    shifts of sixteen periods over the columns, and three of one. Raises BundleError.
+    """
+    if images == 2 * SLSTUDIO_STEPS:
+        columns = float(code.size.width_px)
+        return [
+            each
+            for periods in (SLSTUDIO_PERIODS, 1)
+            for each in _shifted_sines(Axis.COLUMN, columns / periods, SLSTUDIO_STEPS)
+        ]
     count = {axis: min(SLSTUDIO_BITS[axis], code.bits(axis)) for axis in Axis}
     axes_by_count = {2 + sum(count[a] for a in axes): axes for axes in ([Axis.COLUMN], [Axis.ROW], list(Axis))}
     if images not in axes_by_count:
         raise BundleError(
-            f"expected {', '.join(map(str, axes_by_count))} images of a Gray code, found {images}: SLStudio's other "
-            f"codes are phase shifts. {_UNSUPPORTED['phase']}; select Gray Code in SLStudio's preferences, scan again"
+            f"expected {', '.join(map(str, axes_by_count))} images of a Gray code, or 6 of phase shift 2x3, found "
+            f"{images}; its micro phase shift is --format slstudio-micro. Other {_UNSUPPORTED['phase']}"
         )
     middle = [each for axis in axes_by_count[images] for each in code.first_bits(axis, count[axis], inverses=False)]
     return [White(), Black(), *middle]

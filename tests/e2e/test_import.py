@@ -172,7 +172,7 @@ def test_what_does_not_fit_is_refused_in_words(tmp_path: Path) -> None:
     refused(whole, projector="1280x800", says=["8 bits with cells of 1 px would end at column 255", "bundle-sheet.png"])
     refused(whole, "--pattern", "white black columns", says=["expected 18 images", "found 34"])
     refused(whole, "--pattern", "white, black, columns, rows", says=["2 frames ahead of their patterns"])
-    refused(whole, "--format", "slstudio", says=["expected 10, 8, 16 images", "phase shifts are not supported"])
+    refused(whole, "--format", "slstudio", says=["expected 10, 8, 16 images", "phase shifts are described by"])
     refused(whole, "--format", "scan3d", "--names", "{bit}.png", says=["expected one of --format"])
     refused(whole, "--camera", "a", "--camera", "b", says=["expected 1 names of cameras (cam0), found 2"])
     refused(whole, "--format", "scan3d", "--cell-px", 2, says=["expected no --cell-px and --offset-px"])
@@ -185,7 +185,7 @@ def test_what_does_not_fit_is_refused_in_words(tmp_path: Path) -> None:
     # Three steps of a phase instead of a code.
     phases = [np.tile(np.uint8(127 + 100 * np.cos(np.arange(64) / 5 + k)), (48, 1)) for k in (0, 2, 4)]
     three = lay_out(tmp_path / "three", phases, "frameSeq_{:02}.bmp")
-    refused(three, "--format", "slstudio", says=["found 3", "phase shifts are not supported"])
+    refused(three, "--format", "slstudio", says=["found 3", "phase shifts are described by"])
     ten = lay_out(tmp_path / "ten", (phases * 4)[:10], "{:02}.bmp")
     refused(ten, "--format", "slstudio", says=["These may be phase shifts"])
     # Samples of 12 bits in files of 16.

@@ -22,6 +22,7 @@ from slrig.importers.orders import (
     pattern_from_name,
     pattern_words,
     scan3d_sequence,
+    slstudio_micro_sequence,
     slstudio_sequence,
 )
 from slrig.model import Axis, Black, Calibration, Gray, LineShift, Pattern, Pinhole, Sine, Size, White
@@ -340,6 +341,23 @@ def test_pattern_texts_are_parsed_and_written(words: str, wanted: Pattern) -> No
     assert CODE.parse_pattern(pattern_words(wanted)) == wanted
 
 
+def test_sinusoids_are_described_by_period_and_steps() -> None:
+    wanted = [Sine(Axis.COLUMN, 16.5, shift, 4) for shift in range(4)]
+    assert CODE.parse_sequence("columns-sine:16.5/4") == wanted
+    assert CODE.parse_sequence("columns-sine:16.5/-4") == [wanted[k] for k in (0, 3, 2, 1)]
+
+
+def test_slstudios_phase_shifts_are_known() -> None:
+    fine, cue = CODE.size.width_px / 16, float(CODE.size.width_px)
+    assert slstudio_sequence(CODE, 6) == [Sine(Axis.COLUMN, each, k, 3) for each in (fine, cue) for k in range(3)]
+    micro = slstudio_micro_sequence(CODE, 12)
+    assert [(each.shift, each.steps) for each in micro if isinstance(each, Sine)][:5] == [
+        (0, 3), (2, 3), (1, 3), (1, 2), (0, 2),
+    ]  # fmt: skip
+    with pytest.raises(BundleError, match="12 images of SLStudio's micro"):
+        slstudio_micro_sequence(CODE, 11)
+
+
 @pytest.mark.parametrize(
     ("words", "error", "said"),
     [
@@ -347,7 +365,7 @@ def test_pattern_texts_are_parsed_and_written(words: str, wanted: Pattern) -> No
         ("diagonal 3", BundleError, "'diagonal 3'"),
         ("column 3 upside", BundleError, "expected `white`"),
         ("xor02 column 3", BundleError, "XOR-02 and others"),
-        ("sine 0", BundleError, "phase shifts are not supported"),
+        ("sine 0", BundleError, "phase shifts are described by"),
         ("column 10", PatternError, "bit 10 of 10"),
         ("column line 9 of 8", PatternError, "found shift 9"),
     ],
