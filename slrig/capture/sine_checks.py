@@ -124,6 +124,9 @@ def check_agreement(frames: Light, model: LightModel, band: Integers) -> FrameAg
     opposite = opposite_groups(frames, model)
     if opposite:
         return FrameAgreement(none, everywhere, suspects=opposite, opposite=True)
+    exchanged = _find_exchange(frames, model) if fit.jumps > _MANY_JUMPS else ()
+    if exchanged:
+        return FrameAgreement(none, everywhere, exchanged, shows=dict(zip(exchanged, exchanged[::-1], strict=True)))
     limit = fit.limit
     misfits = np.array([fit.misfit(band == each) if np.any(band == each) else 0.0 for each in range(BANDS)])
     where = np.isin(band, np.flatnonzero(misfits > limit**2))
@@ -146,9 +149,6 @@ def check_agreement(frames: Light, model: LightModel, band: Integers) -> FrameAg
     if fit.misfit(everywhere) > (_MAX_MISFIT_OF_A_SCENE + _MAX_MISFIT_SIGMAS * fit.noise) ** 2:
         sines = tuple(place for places in model.groups for place in places)
         return FrameAgreement(none, everywhere, suspects=tuple(sorted(sines)))
-    exchanged = _find_exchange(frames, model) if fit.jumps > _MANY_JUMPS else ()
-    if exchanged:
-        return FrameAgreement(none, everywhere, exchanged, shows=dict(zip(exchanged, exchanged[::-1], strict=True)))
     if fit.jumps > _MAX_PROVING_JUMPS or misfits.max() > (_MAX_PROVING_MISFIT + _MAX_MISFIT_SIGMAS * fit.noise) ** 2:
         return FrameAgreement(none, everywhere)
     return FrameAgreement(model.provable() & (fit.shape.std(axis=1) > _MIN_DEVIATION), everywhere)
