@@ -124,6 +124,9 @@ def check_agreement(frames: Light, model: LightModel, band: Integers) -> FrameAg
     opposite = opposite_groups(frames, model)
     if opposite:
         return FrameAgreement(none, everywhere, suspects=opposite, opposite=True)
+    exchanged = _find_exchange(frames, model) if fit.jumps > _MANY_JUMPS else ()
+    if exchanged:
+        return FrameAgreement(none, everywhere, exchanged, shows=dict(zip(exchanged, exchanged[::-1], strict=True)))
     limit = fit.limit
     misfits = np.array([fit.misfit(band == each) if np.any(band == each) else 0.0 for each in range(BANDS)])
     where = np.isin(band, np.flatnonzero(misfits > limit**2))
@@ -146,9 +149,6 @@ def check_agreement(frames: Light, model: LightModel, band: Integers) -> FrameAg
     if fit.misfit(everywhere) > (_MAX_MISFIT_OF_A_SCENE + _MAX_MISFIT_SIGMAS * fit.noise) ** 2:
         sines = tuple(place for places in model.groups for place in places)
         return FrameAgreement(none, everywhere, suspects=tuple(sorted(sines)))
-    exchanged = _find_exchange(frames, model) if fit.jumps > _MANY_JUMPS else ()
-    if exchanged:
-        return FrameAgreement(none, everywhere, exchanged, shows=dict(zip(exchanged, exchanged[::-1], strict=True)))
     if fit.jumps > _MAX_PROVING_JUMPS or misfits.max() > (_MAX_PROVING_MISFIT + _MAX_MISFIT_SIGMAS * fit.noise) ** 2:
         return FrameAgreement(none, everywhere)
     return FrameAgreement(model.provable() & (fit.shape.std(axis=1) > _MIN_DEVIATION), everywhere)
@@ -220,6 +220,7 @@ def _find_wrong(
     frames = _some_pairs(frames, _SEARCH_PAIRS)
     count, everywhere = len(frames), np.ones(frames.shape[1], dtype=np.bool_)
     tried: list[tuple[float, tuple[int, ...], FrameFit]] = []
+    standing: tuple[tuple[int, ...], tuple[int, ...], dict[int, int]] | None = None
     for _ in range(min(_MAX_WRONG, count - 3 - MIN_SPARE_FRAMES)):
         larger: dict[tuple[int, ...], tuple[float, FrameFit]] = {}
         for places in [places for _, places, _ in tried[:_MIN_TRIED]] or [()]:
@@ -238,7 +239,9 @@ def _find_wrong(
         clear, sines = _CLEARLY_OFF * max(left**0.5, limit), {place for group in model.groups for place in group}
         stands_out = left < _MAX_LEFT_IN_SCENE * before and sines.issuperset(places)
         stands_out = stands_out and all(fit.off(place) > clear for place in places)
-        if not (fits or stands_out) or not all(_is_off(fit, place) for place in places):
+        if stands_out and not fits and standing is None and len(tried) > 1 and tried[1][0] > _MIN_AHEAD * left:
+            standing = (places, (), _shown(fit, places))
+        if not fits or not all(_is_off(fit, place) for place in places):
             continue
         close = [each for each in tried if each[0] < _MIN_AHEAD * left]
         # Of several that fit, the position is continuous without those that are wrong.
@@ -251,7 +254,7 @@ def _find_wrong(
         # Without any of several bits, another position fits.
         if all(place in model.reach for place in suspects) or before > (_DOUBTFUL_MISFIT * limit) ** 2:
             return (), tuple(suspects), {}
-    return None
+    return standing
 
 
 def opposite_groups(frames: Light, model: LightModel) -> tuple[int, ...]:
