@@ -92,13 +92,9 @@ class FrameVerifier:
     """
 
     def __init__(
-        self,
-        name: str,
-        form: CameraFormat,
-        patterns: Sequence[Pattern],
-        frame_names: Sequence[str] | None = None,
+        self, name: str, form: CameraFormat, patterns: Sequence[Pattern], frame_names: Sequence[str] | None = None,
         projector: Size | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.name = name
         self._frame_names = frame_names
         self._projector = projector
@@ -671,11 +667,9 @@ class FrameVerifier:
     def _check_line(self, index: int, pattern: LineShift, ref: ReferenceFrames) -> list[Contradiction]:
         known = self.findings.codes.get(pattern.axis)
         if known is None:
-            has_code = any(isinstance(each, Gray) and each.axis is pattern.axis for each in self._patterns)
-            if has_code:
+            if any(isinstance(each, Gray) and each.axis is pattern.axis for each in self._patterns):
                 self.findings.pending_lines.append(index)
-            elif frame_checks.is_partly_lit(self._samples[index], ref):
-                # Nothing numbers lines that cross those of the scan. That they repeat no other frame is known here.
+            elif frame_checks.is_partly_lit(self._samples[index], ref):  # crossing lines, which no code numbers
                 self.findings.verified.add(index)
             return []
         code, gray = known

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from slrig.cli.init import terminal
 from slrig.cli.options import Keys, Unit
 from slrig.errors import ConfigError
 
@@ -135,6 +134,7 @@ def import_images(
 
 def _propose(found: UnderstoodFolder, sheet: Path, *, yes: bool) -> None:
     """Print what images were taken for, draw it, ask. Raises ConfigError: it is doubtful, and nobody can be asked."""
+    from slrig.cli.init import terminal
     from slrig.importers import write_contact_sheet
 
     write_contact_sheet(sheet, found)
