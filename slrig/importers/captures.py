@@ -7,7 +7,7 @@ import io
 import re
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +44,7 @@ from slrig.importers.orders import (
     slstudio_sequence,
 )
 from slrig.model import Axis, Black, CameraFormat, Gray, LengthUnit, Pattern, Pixels, Shot, Size, White
+from slrig.patterns import gray_bits
 
 CALIBRATIONS = tuple(f"calibration.{each}" for each in ("yml", "yaml", "xml", "json", "npz", "mat"))
 MAX_LIST_BYTES = 2**20
@@ -120,6 +121,7 @@ def import_capture(
             message = f"{folder}: expected {len(images.cameras)} names of cameras ({known}), found {len(names)}"
             raise BundleError(message)
         images.cameras = dict(zip(names, images.cameras.values(), strict=True))
+    drop_constant_bits(images, code.size)
     formats = {}
     for name, files in images.cameras.items():
         formats[name], note = _common_format(files, bit_depth)
@@ -148,6 +150,27 @@ def import_capture(
 def _home(source: Path) -> Path:
     """Return the folder of a source of images: itself, or that of a file of several."""
     return source if source.is_dir() else source.parent
+
+
+def drop_constant_bits(images: ImageAssignment, size: Size) -> None:
+    """Leave out the first bits of a code that has more than the projector's cells need: they are dark everywhere, and
+    the others are those of the shorter code.
+    """
+    for name, files in images.cameras.items():
+        kept: list[tuple[SourceImage, Pattern]] = []
+        for image, pattern in files:
+            if isinstance(pattern, Gray):
+                needed = gray_bits(size.along(pattern.axis), pattern.cell_px, pattern.offset_px)
+                more = max(pattern.bits - needed, 0)
+                if pattern.bit < more:
+                    images.notes.append(
+                        f"{image.name}: left out, bit {pattern.bit} of {pattern.bits} is the same on all "
+                        f"{size.along(pattern.axis)} {pattern.axis}s"
+                    )
+                    continue
+                pattern = replace(pattern, bit=pattern.bit - more, bits=pattern.bits - more)
+            kept.append((image, pattern))
+        images.cameras[name] = kept
 
 
 def _assign_images(folder: Path, code: ProjectorCode, naming: ImageNaming) -> ImageAssignment:

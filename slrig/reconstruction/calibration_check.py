@@ -42,6 +42,8 @@ _AGREES_PX = 0.5  # median residual of a right calibration with code cells of on
 _REFUTED_PX, _REFUTED_SIGMA = 5.0, 20.0
 _MAX_SYSTEMATIC_PX = 0.1  # of a right calibration
 _SIGNIFICANT_CHI2 = 10.0  # for each parameter of a fit: by chance once in 10^8 scans
+_MANY_FAR, _FEW_FAR = 0.1, 0.2  # share of points that are far off; of those, without a mistake
+_MIN_DETERMINED = 2.0  # standard deviations of an implied error of the coded position
 _PRIOR_FOCAL, _PRIOR_CENTRE, _PRIOR_K1 = 0.03, 0.03, 0.05  # relative to focal length and width; radial distortion
 _MAX_LOG_SCALE, _MAX_SHIFT = np.log(4), 1.0  # of a picture; the shift relative to its width
 _SCALES = [np.array([each]) for each in np.linspace(-1.3, 1.3, 57)]
@@ -260,8 +262,8 @@ class CalibrationCheck:
 
     devices : camera and projector; pairs : number of points compared; sigma_px : median standard deviation of a
     residual by noise and resolution; median_px : median absolute residual; systematic_px : rms of the means over the
-    8 x 8 cells of the image, less what noise adds. cause : mistake that explains
-    residuals that refute the calibration, empty if none is found or needed.
+    8 x 8 cells of the image, less what noise adds. cause : mistake that explains residuals that refute the calibration,
+    empty if none is found or needed.
     """
 
     devices: tuple[Pinhole, Pinhole]
@@ -285,15 +287,16 @@ class CalibrationCheck:
         # Residuals that real lenses leave may imply any error where light sheets hardly cross the baseline.
         is_large = self.systematic_px > _MAX_SYSTEMATIC_PX or self.median_px > 2 * self.sigma_px
         implied_px = self.coded_error_px if is_large else 0.0
-        return not max(self.median_px, implied_px) <= limit_px
+        return bool(self.cause) or not max(self.median_px, implied_px) <= limit_px
 
     def error_mm(self, points_mm: FloatArray, normals: FloatArray, axis: Axis) -> FloatArray:
         """(n,) float64: error along the normals (n, 3) that the residuals imply, as a standard deviation.
 
         That of the fit, with its own standard deviation; for a fit that is not significant, its standard deviation
-        alone; without one that explains the residuals, the effect of their median on the coded position.
+        alone; without one that explains the residuals and determines the coded positions, the effect of their median on
+        these.
         """
-        fit = self.explained
+        fit = self.explained if self._is_determined else None
         camera, projector = self.devices
         pairs = PixelPairs(project(camera, points_mm), project(projector, points_mm), np.zeros(0), axis)
         uncertain_px = self.median_px
@@ -311,9 +314,17 @@ class CalibrationCheck:
 
     @property
     def coded_error_px(self) -> float:
-        """Median error of the coded position that the residuals imply: that of a fit, 0 if it is not significant."""
-        fit = self.explained
+        """Median error of the coded position that the residuals imply: that of a fit, 0 if it is not significant; their
+        median if they do not determine it.
+        """
+        fit = self.explained if self._is_determined else None
         return self.median_px if fit is None else fit.coded_error_px if self.is_significant else 0.0
+
+    @property
+    def _is_determined(self) -> bool:
+        """False if the residuals show an error, but hardly how much the coded positions are off."""
+        fit = self.explained
+        return fit is None or not self.is_significant or fit.coded_error_px > _MIN_DETERMINED * fit.coded_sigma_px
 
     @property
     def is_significant(self) -> bool:
@@ -345,8 +356,31 @@ def check_calibration(
     median, sigma = disagreement_px(*devices, pairs), float(np.median(pairs.sigma_px))
     fit = fit_calibration(*devices, pairs) if median <= 4 * _REFUTED_PX else None
     systematic = _systematic_px(*devices, pairs) if fit is not None else median
-    check = CalibrationCheck(devices, len(pairs), median, systematic, sigma, fit)
-    return replace(check, cause=explain_residuals(*devices, pairs, code)) if check.is_refuted else check
+    mistake = _code_mistake(*devices, pairs, code)
+    check = CalibrationCheck(devices, len(pairs), median, systematic, sigma, fit, mistake)
+    if mistake or not check.is_refuted:
+        return check
+    return replace(check, cause=explain_residuals(*devices, pairs, code))
+
+
+def _code_mistake(camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, ...]) -> str:
+    """Name the exchanged or inverted bits without which hardly any of many points are far from where they belong; empty
+    if there are none.
+
+    A mistake of the code displaces some points by much, and others not at all: their median may be small.
+    """
+    pairs = pairs.thinned(_TRIAL_POINTS)
+
+    def far(each: PixelPairs) -> float:
+        return float(np.mean(~(np.abs(epipolar_residual_px(camera, projector, each)) <= _REFUTED_PX)))
+
+    stated = far(pairs)
+    if stated < _MANY_FAR:
+        return ""
+    left, cause = min((far(trial.pairs), trial.cause) for trial in _exchanged_bits(camera, projector, pairs, code))
+    if left > _FEW_FAR * stated:
+        return ""
+    return f"{cause} (without it {left:.1%} of the points are more than {_REFUTED_PX:g} px off, with it {stated:.0%})"
 
 
 def _cells(pixels_px: FloatArray, size: Size, count: int) -> NDArray[np.intp]:

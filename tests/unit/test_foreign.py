@@ -14,8 +14,16 @@ import yaml
 from slrig.bundle import read_calibration, write_calibration
 from slrig.errors import BundleError, CalibrationError, PatternError, SlrigError
 from slrig.importers.calibrations import import_calibration, write_any_calibration
-from slrig.importers.captures import ImageNaming, assign_images, import_capture, parse_size
+from slrig.importers.captures import (
+    ImageAssignment,
+    ImageNaming,
+    assign_images,
+    drop_constant_bits,
+    import_capture,
+    parse_size,
+)
 from slrig.importers.documents import MAX_YAML_BYTES, read_yaml
+from slrig.importers.images import SourceImage
 from slrig.importers.orders import (
     ProjectorCode,
     compile_name_template,
@@ -345,6 +353,18 @@ def test_sinusoids_are_described_by_period_and_steps() -> None:
     wanted = [Sine(Axis.COLUMN, 16.5, shift, 4) for shift in range(4)]
     assert CODE.parse_sequence("columns-sine:16.5/4") == wanted
     assert CODE.parse_sequence("columns-sine:16.5/-4") == [wanted[k] for k in (0, 3, 2, 1)]
+
+
+def test_bits_that_a_projector_never_changes_are_left_out() -> None:
+    image = SourceImage(Path("row-10.png"), "row-10.png", "row-10")
+    eleven = [(image, Gray(Axis.ROW, bit, 11)) for bit in range(11)]
+    assignment = ImageAssignment({"cam0": [*eleven, (image, Gray(Axis.COLUMN, 0, 11))]})
+
+    drop_constant_bits(assignment, Size(1280, 800))
+
+    kept = [pattern for _, pattern in assignment.cameras["cam0"]]
+    assert kept == [*(Gray(Axis.ROW, bit, 10) for bit in range(10)), Gray(Axis.COLUMN, 0, 11)]
+    assert assignment.notes == ["row-10.png: left out, bit 0 of 11 is the same on all 800 rows"]
 
 
 def test_slstudios_phase_shifts_are_known() -> None:

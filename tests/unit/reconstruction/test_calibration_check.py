@@ -13,7 +13,7 @@ from scipy.interpolate import griddata
 from scipy.spatial.transform import Rotation
 
 from slrig.model import Axis, FloatArray, Gray, LineShift, Pinhole, Size
-from slrig.reconstruction import CalibrationCheck, PixelPairs, check_calibration, find_cross_line_pairs
+from slrig.reconstruction import CalibrationCheck, CalibrationFit, PixelPairs, check_calibration, find_cross_line_pairs
 from slrig.reconstruction.identification import StripeEnsemble
 
 CODES = Gray(Axis.COLUMN, 0, 10), Gray(Axis.ROW, 0, 9)
@@ -254,3 +254,16 @@ def test_one_frame_of_rows_shows_a_small_turn(crossed_stripes: tuple[StripeEnsem
 
     assert not check.is_refuted
     assert check.is_significant
+
+
+def test_an_error_that_the_rows_do_not_determine_refutes_nothing() -> None:
+    devices = CAMERA, PROJECTOR
+    fit = CalibrationFit(
+        devices, *devices, turned_deg=10.4, shifted_mm=8.3, residual_px=0.22, coded_error_px=434.0,
+        coded_sigma_px=453.0, is_significant=True,
+    )  # fmt: skip
+    found = CalibrationCheck(devices, 200_000, 0.47, 0.7, 0.1, fit)
+
+    assert not found.is_refuted
+    assert found.coded_error_px == 0.47
+    assert replace(found, fit=replace(fit, coded_sigma_px=20.0)).is_refuted
