@@ -290,7 +290,7 @@ def centroid_residual_px(
 def asymmetry_sigma_px(
     frames: AxisFrames, measured: PositionMap, centred: PositionMap, usable: NDArray[np.bool_], noise: NoiseModel, /
 ) -> NDArray[np.float32]:
-    """(H, W): standard deviation, projector px, by which light from other surfaces displaces points fitted to 5 x 5
+    """(H, W): standard deviation, camera px, by which light from other surfaces displaces points fitted to 5 x 5
     pixels.
 
     A line that lights a pixel straight from the projector is symmetric about its centre, whatever blur and response:
@@ -345,7 +345,10 @@ def asymmetry_sigma_px(
     squared -= max(float(np.quantile(squared[known][::_QUANTILE_STEP], _USUAL_SHARE)), 0.0)
     independent = np.maximum(pixels * (_MEAN_PX / _FITTED_PX) ** 2, 1)
     squared[~(known & (squared > _MIN_EXCESS * np.maximum(noise_squared, _TINY) * np.sqrt(2 / independent)))] = 0
-    return np.asarray(np.sqrt(squared), dtype=np.float32)
+    down, across = np.gradient(measured.position)
+    slope = np.hypot(down, across)
+    is_steep = (squared > 0) & (slope > MIN_GRADIENT)
+    return np.asarray(np.divide(np.sqrt(squared), slope, out=np.zeros_like(squared), where=is_steep))
 
 
 def _estimate_variance(

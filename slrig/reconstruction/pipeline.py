@@ -367,12 +367,8 @@ def align_points(
         residual_px = centroid_residual_px(measured, centred, usable, blur_px, period_px, near_shadow)
         asymmetry_px = asymmetry_sigma_px(frames, measured, centred, usable, image.position_noise)
         measured = correct_curvature(centred, usable, blur_px**2, period_px)
-        extra_sigma_px = np.hypot(step_sigma_px(near_step), residual_px)
-        if asymmetry_px.any():
-            slope = np.hypot(*np.gradient(measured.position))
-            along = np.divide(asymmetry_px, slope, out=np.zeros_like(asymmetry_px), where=asymmetry_px > 0)
-            extra_sigma_px = np.hypot(extra_sigma_px, np.nan_to_num(along))
-        del centred, residual_px
+        extra_sigma_px = np.sqrt(step_sigma_px(near_step) ** 2 + residual_px**2 + asymmetry_px**2)
+        del centred, residual_px, asymmetry_px
         marked = mark_refused_pixels(
             code, frames, measured.position, tables.position_table, near_shadow, near_step
         )  # fmt: skip
