@@ -277,7 +277,7 @@ class _Checks:
         shown = tuple(self._patterns[p] for p in places)
         if not any(isinstance(p, Sine) for p in shown):
             return 0.0, True
-        model = LightModel.of(shown, self._projector and self._projector.along(axis))
+        model = LightModel.from_patterns(shown, self._projector and self._projector.along(axis))
         misfit, limit = order_misfit(self.relations.light[[order[p] for p in places]], model)
         return misfit, misfit < max(limit, _MAX_LEFT_FRACTION * self._misfits[axis])
 

@@ -378,7 +378,7 @@ class LightModel:
 
     @classmethod
     @lru_cache(maxsize=32)
-    def of(cls, patterns: tuple[Pattern, ...], extent_px: int | None = None) -> LightModel:
+    def from_patterns(cls, patterns: tuple[Pattern, ...], extent_px: int | None = None) -> LightModel:
         """Return the model of white, black, bits and at least one sinusoid. extent_px : of the projector, if known."""
         position_px = _positions_px(patterns, extent_px)
         step_px = position_px[1] - position_px[0]

@@ -95,7 +95,7 @@ def check_axis(
         return _NOTHING
     rows = np.tile(row[chosen[: len(chosen) // 2]], 2)
     found = check_agreement(
-        stack[:, chosen], LightModel.of(shown, projector and projector.along(axis)), assign_bands(rows)
+        stack[:, chosen], LightModel.from_patterns(shown, projector and projector.along(axis)), assign_bands(rows)
     )
     verified = frozenset(int(members[place]) for place in np.flatnonzero(found.fitting))
     lights = {i: light for i, light in zip(members, found.lights, strict=False) if isinstance(patterns[i], Sine)}

@@ -133,7 +133,10 @@ def import_images(
 
 
 def _propose(found: UnderstoodFolder, sheet: Path, *, yes: bool) -> None:
-    """Print what images were taken for, draw it, ask. Raises ConfigError: it is doubtful, and nobody can be asked."""
+    """Print and draw which pattern each image was found to show, and ask whether to go on.
+
+    Raises ConfigError: there are doubts, and no terminal to ask at.
+    """
     from slrig.cli.init import terminal
     from slrig.importers import write_contact_sheet
 

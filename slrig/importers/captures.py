@@ -209,7 +209,7 @@ def _assign_by_looks(
 
 
 def _fits(known: ImageAssignment, found: UnderstoodFolder) -> bool:
-    """True if images show what a known order says, but for some that show the pattern of another image."""
+    """True if images show what a known order says, except a few that show the pattern of another image."""
     shown = {path: pattern for files in found.assigned.values() for path, pattern in files}
     differing = {path for files in known.cameras.values() for path, pattern in files if shown.get(path) != pattern}
     return differing <= found.faults and len(differing) <= _MAX_EXPLAINED
@@ -339,7 +339,7 @@ def _assign_from_list(folder: Path, code: ProjectorCode, path: Path) -> ImageAss
         if not parts and not place.is_file():
             images, assigned.notes = list_images_below(folder)
             parts = {image.place: image for image in images}
-        image = parts.get(place) or SourceImage.of_file(place)
+        image = parts.get(place) or SourceImage.from_file(place)
         assigned.cameras.setdefault(row.get("camera") or "cam0", []).append((image, pattern))
     if not assigned.cameras:
         raise BundleError(f"{path}: expected a line for each image, found none")

@@ -131,4 +131,5 @@ def _same_codes(
         sums = np.column_stack([np.bincount(index.ravel(), pixels[known, i], len(codes)) for i in (0, 1)])
         middles.append(dict(zip(map(tuple, codes.tolist()), sums / counts[:, None], strict=True)))
     common = [code for code in middles[0] if code in middles[1]]
-    return tuple(np.array([each[code] for code in common]).reshape(-1, 2) for each in middles)  # type: ignore[return-value]
+    one, other = (np.array([each[code] for code in common]).reshape(-1, 2) for each in middles)
+    return one, other

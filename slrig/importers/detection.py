@@ -412,27 +412,29 @@ class Order:
         return self.shows[:2] == ("white", "black") and has_inverses and len(set(self.bits.values())) < len(self.bits)
 
 
-def find_orders(
-    images: Sequence[_Image],
-    resolved: Mapping[Axis, int],
-    full: Mapping[Axis, int],
-    finest: Mapping[Axis, float],
-    *,
-    direct_first: bool,
-    pairs: bool,
-    turns: Sequence[int],
-) -> list[Order]:
+@dataclass(frozen=True, slots=True)
+class CodeLevels:
+    """Bits of the code of each axis. resolved : levels of its chain; full : bits that the projector needs with cells of
+    one pixel; finest : swing of the finest bit that is resolved, after which a bit may be that is not. direct_first :
+    each bit comes before its inverse; pairs : each bit comes with its inverse.
+    """
+
+    resolved: Mapping[Axis, int]
+    full: Mapping[Axis, int]
+    finest: Mapping[Axis, float]
+    direct_first: bool
+    pairs: bool
+
+
+def find_orders(images: Sequence[_Image], levels: CodeLevels, turns: Sequence[int]) -> list[Order]:
     """Return the orders of a code that explain the images, best first.
 
-    resolved : levels of each axis' chain; full : bits that the projector needs with cells of one pixel; finest :
-    swing of the finest bit that is resolved, after which a bit may be that is not; turns : numbers of images that are
-    moved from the end to the front.
+    turns : numbers of images that are moved from the end to the front.
     """
     found: list[Order] = []
     for turned in turns:
         moved = [images[(place - turned) % len(images)] for place in range(len(images))]
-        templates = _templates(moved, resolved, full, finest, direct_first=direct_first, pairs=pairs)
-        for template, bits, prior in sorted(templates, key=lambda each: each[2]):
+        for template, bits, prior in sorted(_templates(moved, levels), key=lambda each: each[2]):
             if found and prior > found[0].cost + _MAX_WORSE:
                 break
             cost, shows, missing, exchanged = _align(
@@ -464,17 +466,12 @@ def _other_halves(order: Order, images: Sequence[_Image]) -> list[Order]:
 
 
 def _templates(
-    images: Sequence[_Image],
-    resolved: Mapping[Axis, int],
-    full: Mapping[Axis, int],
-    finest: Mapping[Axis, float],
-    *,
-    direct_first: bool,
-    pairs: bool,
+    images: Sequence[_Image], levels: CodeLevels
 ) -> Iterator[tuple[list[tuple[CodeBit, float]], dict[Axis, int], float]]:
     """Yield codes in the order in which the images may show them, each bit with its place in its chain, how many bits
     each axis has, and what speaks against it.
     """
+    resolved, full = levels.resolved, levels.full
     places = {axis: [i for i, each in enumerate(images) if each.axis is axis and each.bit >= 0 and each.is_first]
               for axis in resolved}  # fmt: skip
     axes = sorted(resolved, key=lambda axis: np.median(places[axis]))
@@ -482,7 +479,7 @@ def _templates(
     mixed = len(axes) == 2 and max(spans[0]) > min(spans[1]) + 1
     rising = sum(_trend(images, axis) for axis in axes) >= 0
     spare = sum(1 for each in images if each.bit < 0)
-    each_takes = 2 if pairs else 1
+    each_takes = 2 if levels.pairs else 1
     gaps = {axis: _first_gap(images, axis) for axis in axes}
     span = range(_MAX_HIDDEN + 1)
     ends = [
@@ -497,7 +494,7 @@ def _templates(
         if sum(map(sum, hidden)) * each_takes > spare + 1:
             continue
         bits = {axis: resolved[axis] + sum(each) for axis, each in zip(axes, hidden, strict=True)}
-        prior = sum(_prior(bits[a], full[a], finest[a], each) for a, each in zip(axes, hidden, strict=True))
+        prior = sum(_prior(bits[a], full[a], levels.finest[a], each) for a, each in zip(axes, hidden, strict=True))
         numbers: dict[Axis, list[tuple[int, float]]] = {}
         for axis, (coarse, more, _) in zip(axes, hidden, strict=True):
             every = list(range(bits[axis]))
@@ -506,7 +503,7 @@ def _templates(
             skipped = [0.0 if not more or bit < gap else 0.5 if bit == gap else more for bit in every]
             ordered = [(bit, bit - coarse - skip) for bit, skip in zip(every, skipped, strict=True)]
             numbers[axis] = ordered if rising else ordered[::-1]
-        both = (not direct_first, direct_first) if pairs else (not direct_first,)
+        both = (not levels.direct_first, levels.direct_first) if levels.pairs else (not levels.direct_first,)
         for order in (axes, axes[::-1]) if mixed else (axes,):
             for template in _arrangements(order, numbers, both, mixed=mixed):
                 yield template, bits, prior

@@ -47,7 +47,7 @@ class SourceImage:
     may_be_idle: bool = False
 
     @classmethod
-    def of_file(cls, path: Path) -> SourceImage:
+    def from_file(cls, path: Path) -> SourceImage:
         """Return the first image of a file."""
         return cls(path, path.name, path.stem)
 
@@ -132,7 +132,7 @@ def without_idle_ends(images: Sequence[SourceImage]) -> Iterator[Sequence[Source
 
 
 def _list_pages(path: Path) -> list[SourceImage]:
-    first = SourceImage.of_file(path)
+    first = SourceImage.from_file(path)
     if path.suffix.lower() not in (".tif", ".tiff"):
         return [first]
     try:

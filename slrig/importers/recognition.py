@@ -506,7 +506,7 @@ class Recognition:
     def _readings(self, devices: Sequence[Device], roles: tuple[str, ...], poses: Sequence[Pose]) -> Iterator[Reading]:
         """Yield the calibrations that the devices in these roles have, one for each direction of the pose."""
         sizes = [self._size(role, device, roles) for role, device in zip(roles, devices, strict=True)]
-        placed = self._placed(devices, poses)
+        placed = self._place_devices(devices, poses)
         moved = [(role, pose) for role, pose in zip(roles, placed, strict=True) if pose is not None]
         start = next((role for role, pose in zip(roles, placed, strict=True) if pose is None), "world")
         is_given = bool(self._keys.pose) or self._keys.inverse
@@ -560,7 +560,7 @@ class Recognition:
             self._lenses[key] = as_lens(device.matrix, device.terms, size, name, equidistant=device.is_equidistant)
         return self._lenses[key]
 
-    def _placed(self, devices: Sequence[Device], poses: Sequence[Pose]) -> list[Pose | None]:
+    def _place_devices(self, devices: Sequence[Device], poses: Sequence[Pose]) -> list[Pose | None]:
         """Return the pose of each device, None for those at the origin. Raises CalibrationError: some are missing."""
         labels = [device.labels for device in devices]
         owners = [(_pose_owner(pose.labels, labels), pose) for pose in poses]

@@ -12,6 +12,7 @@ from slrig.importers.detection import (
     RIVAL,
     Chain,
     CodeBit,
+    CodeLevels,
     CodePlace,
     Light,
     Lit,
@@ -159,22 +160,18 @@ def _read(
     """Return explanations of the images, best first. Raises BundleError: there is none."""
     images = describe_images(lit, looks, chains, [*looks.copies, *leave], direct_first=direct_first)
     places = list(images)
-    full = {axis: gray_bits(projector.along(axis), 1, 0) for axis in Axis}
-    resolved = {axis: chain.levels[-1] + 1 for axis, chain in chains.items()}
+    levels = CodeLevels(
+        resolved={axis: chain.levels[-1] + 1 for axis, chain in chains.items()},
+        full={axis: gray_bits(projector.along(axis), 1, 0) for axis in Axis},
+        finest={axis: chain.units[-1].strength for axis, chain in chains.items()},
+        direct_first=direct_first,
+        pairs=pairs,
+    )
     extents = {axis: projector.along(axis) for axis in chains}
-    finest = {axis: chain.units[-1].strength for axis, chain in chains.items()}
     orders: list[Order] = []
     readings: list[Reading] = []
     for turns in ((0,), (1, -1, 2, -2)):
-        orders += find_orders(
-            [images[place] for place in places],
-            resolved,
-            full,
-            finest,
-            direct_first=direct_first,
-            pairs=pairs,
-            turns=turns,
-        )
+        orders += find_orders([images[place] for place in places], levels, turns)
         orders.sort(key=lambda each: each.cost)
         readings.clear()
         for order in orders[:_MAX_READ]:

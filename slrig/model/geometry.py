@@ -74,6 +74,11 @@ class Axis(StrEnum):
     COLUMN = "column"
     ROW = "row"
 
+    @property
+    def other(self) -> Axis:
+        """The other coordinate."""
+        return Axis.ROW if self is Axis.COLUMN else Axis.COLUMN
+
 
 @dataclass(frozen=True, slots=True)
 class Pinhole:

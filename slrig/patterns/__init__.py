@@ -19,8 +19,14 @@ from slrig.patterns.sequence import (
     scan_patterns,
     with_cross_lines,
 )
-from slrig.patterns.sine_positions import SinePosition, sine_periods_px, sine_position_px, sine_turns
-from slrig.patterns.sinusoids import level_lines, require_numbered
+from slrig.patterns.sine_positions import (
+    SinePosition,
+    level_lines,
+    require_numbered,
+    sine_periods_px,
+    sine_position_px,
+    sine_turns,
+)
 
 __all__ = [
     "MIN_BORDER_DISTANCE_PX",

@@ -61,7 +61,7 @@ class PixelPairs:
 
     camera_px, projector_px : (n, 2) float64, (column, row); sigma_px : (n,) float64, standard deviation of the
     coordinate of the second axis; axis : the one that numbers the stripes, whose coordinate is exact. period_px : the
-    second coordinate is known but for multiples of it; infinite if it is known.
+    second coordinate may be off by multiples of it; infinite if it is known.
     """
 
     camera_px: FloatArray
@@ -104,9 +104,7 @@ def find_correspondences(ensemble: StripeEnsemble, second: SecondAxis, axis: Axi
         known = np.isfinite(other)
         points, coded, other, sigma = points[known], coded[known], other[known], sigma[known]
     else:
-        ends = ensemble.bridge_after.copy()
-        ends[ensemble.offsets[1:] - 1] = True
-        index, share, other = second.edges(points, ends)
+        index, share, other = second.edges(points, ensemble.ends)
         points = points[index] + share[:, None] * (points[index + 1] - points[index])
         coded, sigma = coded[index], np.full(len(index), _EDGE_SIGMA_PX)
     pair = (coded, other) if axis is Axis.COLUMN else (other, coded)
@@ -120,12 +118,11 @@ def find_cross_line_pairs(
     """Projector pixels where stripes cross the edges of half-lit lines along the other axis, played once.
 
     difference : (H, W), light of that frame minus the middle of white and black. Which of the edges a crossing belongs
-    to is not known: it gets the one nearest to the calibration's prediction.
+    to is not known: it gets the one nearest to the calibration's prediction. origin_px : pixel of the camera at the
+    first pixel of `difference` and of the stripes.
     """
-    axis = Axis.COLUMN if lines.axis is Axis.ROW else Axis.ROW
-    ends = ensemble.bridge_after.copy()
-    ends[ensemble.offsets[1:] - 1] = True
-    index, share = find_crossings(ensemble.points_px, ends, sample_image(difference, ensemble.points_px))
+    axis = lines.axis.other
+    index, share = find_crossings(ensemble.points_px, ensemble.ends, sample_image(difference, ensemble.points_px))
     points = ensemble.points_px[index]
     points = points + share[:, None] * (ensemble.points_px[index + 1] - points) + np.array(origin_px)
     coded = np.repeat(ensemble.position_px, np.diff(ensemble.offsets))[index]
@@ -137,8 +134,9 @@ def find_cross_line_pairs(
     predicted = project(projector, camera.centre_mm + depth * pixel_rays(camera, points))[:, along]
     first_px = lines.shift - 0.5
     steps = np.rint((np.where(np.isfinite(predicted), predicted, middle_px) - first_px) / lines.line_width_px)
-    pair[:, along] = first_px + steps * lines.line_width_px
-    return pairs
+    numbered = pair.copy()
+    numbered[:, along] = first_px + steps * lines.line_width_px
+    return replace(pairs, projector_px=numbered)
 
 
 @dataclass(frozen=True, slots=True)

@@ -234,6 +234,13 @@ class StripeEnsemble(NamedTuple):
     stripe: IntArray
     bridge_after: NDArray[np.bool_]
 
+    @property
+    def ends(self) -> NDArray[np.bool_]:
+        """(n,) bool: points whose next point is of another stripe or curve."""
+        ends = self.bridge_after.copy()
+        ends[self.offsets[1:] - 1] = True
+        return ends
+
     def without_points(self) -> StripeEnsemble:
         """Curves and joins without the points, for use after triangulation."""
         empty = np.zeros((0, 2))

@@ -293,7 +293,7 @@ def asymmetry_sigma_px(
     """(H, W): standard deviation, camera px, by which light from other surfaces displaces points fitted to 5 x 5
     pixels.
 
-    A line that lights a pixel straight from the projector is symmetric about its centre, whatever blur and response:
+    A line that lights a pixel straight from the projector is symmetric about its centre with any blur and response:
     the phases of its harmonics agree. Light that comes by way of another surface displaces each harmonic in its own
     way; the difference between the positions by a higher and by the first one is about as large as the displacement
     by the first. Counted where noise does not explain it, beyond what most of the image shows. Pixels whose brightness

@@ -194,7 +194,7 @@ class _Found(NamedTuple):
     def unknown(cls, refusal: NDArray[np.uint8]) -> _Found:
         """No positions yet."""
         part = np.full((8, *refusal.shape), np.nan, dtype=np.float32)
-        return cls(part[0], part[1], part[2], part[3], part[4], part[5], part[6], part[7], refusal.copy())
+        return cls._make([*part, refusal.copy()])
 
     def rows(self, rows: slice) -> _Found:
         """Select rows, as views."""

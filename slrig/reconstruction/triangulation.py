@@ -401,8 +401,7 @@ def triangulate_camera_projector(
     not monotonic. Also returns (n,) uint8, `Refusal`: the cause for every point of the ensemble that is left out.
     """
     points, deviation, along, cause = intersect_light_sheets(ensemble, camera, projector, axis)
-    other = Axis.ROW if axis is Axis.COLUMN else Axis.COLUMN
-    outside = ~((along > -_BORDER_PX) & (along < projector.size.along(other) - 1 + _BORDER_PX))
+    outside = ~((along > -_BORDER_PX) & (along < projector.size.along(axis.other) - 1 + _BORDER_PX))
     cause[outside & (cause == Refusal.NONE)] = Refusal.OFF_PROJECTOR
     curves = SheetCurves(
         offsets=ensemble.offsets,

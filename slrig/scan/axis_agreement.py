@@ -73,7 +73,7 @@ def check_cameras(
 
 def _refutation(name: str, check: CalibrationCheck, axis: Axis) -> str:
     """Say why a calibration is not that of the frames, and what to do."""
-    other = Axis.ROW if axis is Axis.COLUMN else Axis.COLUMN
+    other = axis.other
     where = f"{other}s are {check.median_px:.1f} px (median of {check.pairs} points) from where it puts them"
     if not np.isfinite(check.median_px):
         where = "most rays do not meet in front of the devices, or the lenses cannot have imaged them"
@@ -136,7 +136,7 @@ def axis_test(
     names : cameras in the order of `merged.camera`; stated_mm : (n,) float64.
     """
     points, added, notes, results = merged.curves.points_mm, np.zeros(len(stated_mm)), [], []
-    other = Axis.ROW if agreement.axis is Axis.COLUMN else Axis.COLUMN
+    other = agreement.axis.other
     for index, name in enumerate(names):
         check, own = agreement.checks.get(name), merged.camera == index
         if check is None or not own.any():

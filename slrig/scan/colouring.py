@@ -71,7 +71,7 @@ def places_px(curves: SheetCurves, axis: Axis) -> NDArray[np.float64]:
 
 def _at_border(curves: SheetCurves, projector: Pinhole, axis: Axis) -> NDArray[np.bool_]:
     """(n,) bool: points in the projector's outermost pixels."""
-    across, along = projector.size.along(axis), projector.size.along(Axis.ROW if axis is Axis.COLUMN else Axis.COLUMN)
+    across, along = projector.size.along(axis), projector.size.along(axis.other)
     outermost = _within(curves.position_px, across)
     return np.asarray(np.repeat(outermost, np.diff(curves.offsets)) | _within(curves.along_px, along))
 

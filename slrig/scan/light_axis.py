@@ -84,8 +84,7 @@ def weakness(axis: Axis, shown: Collection[Axis], share: float, *, on_request: b
     if len(shown) == 1:
         cure = _BOTH
     elif on_request:
-        other = Axis.ROW if axis is Axis.COLUMN else Axis.COLUMN
-        cure = f"The {other}s were played, too, and cross it more steeply: leave out {setting('axis')}"
+        cure = f"The {axis.other}s were played, too, and cross it more steeply: leave out {setting('axis')}"
     else:
         cure = "Both axes were played: turn the projector about its view by 45°"
     times = f"{1 / share:.1f}" if share > _NEXT_TO_NONE else f"more than {1 / _NEXT_TO_NONE:.0f}"

@@ -267,19 +267,22 @@ class _CameraFrames:
         self._second: FrameStacks | None = None
         self._cross_lines = _single_cross_lines(self._wanted, axis)
         self._cross_image: NDArray[Any] | None = None
-        patterns = axis_patterns(self._wanted, name, axis)
+        self._patterns = axis_patterns(self._wanted, name, axis)
+        self._second_patterns: AxisPatterns | None = None
+        with suppress(PatternError):  # the code of the other axis is not complete
+            self._second_patterns = axis_patterns(self._wanted, name, axis.other)
         if one_exposure and all(self._wanted[each] == 1 for each in used if isinstance(each, Gray | LineShift | Sine)):
             form = header.cameras[name]
             stacks = FrameStacks(
-                patterns,
+                self._patterns,
                 form.size.shape,
                 full_scale=float(form.full_scale),
                 reference_repeats=reference_repeats(used, axis),
             )
-            tables = _tables(patterns, header.projector)
+            tables = _tables(self._patterns, header.projector)
             self._stream = CameraStream(stacks, tables, self._limits, report_step=self._entered, region=self._asked)
-            if (second := self._second_patterns()) is not None:
-                self._second = FrameStacks(second, form.size.shape, full_scale=float(form.full_scale))
+            if self._second_patterns is not None:
+                self._second = FrameStacks(self._second_patterns, form.size.shape, full_scale=float(form.full_scale))
 
     @property
     def _asked(self) -> RegionMask | None:
@@ -322,7 +325,7 @@ class _CameraFrames:
         capture = Capture(header.projector, header.patterns, header.cameras, tuple(self._kept))
         for shot in used_shots(capture, self._name):
             self._keep_colour(shot)
-        second = self._second_patterns()
+        second = self._second_patterns
         if exposure_count([shot.exposure_s for shot in self._kept]) > 1:
             fused = fuse_exposures(capture, self._name, self._axis)
             frames, noise = fused.frames, fused.noise
@@ -334,29 +337,21 @@ class _CameraFrames:
             frames, noise = axis_frames(capture, self._name, self._axis), None
             if second is not None:
                 self._second = FrameStacks.from_frames(axis_frames(capture, self._name, second.gray.axis))
-        tables = _tables(axis_patterns(self._wanted, self._name, self._axis), self._header.projector)
+        tables = _tables(self._patterns, self._header.projector)
         curves = camera_curves(frames, tables, self._limits, report_step=self._entered, noise=noise, region=self._asked)
         return curves, frames, fused
-
-    def _second_patterns(self) -> AxisPatterns | None:
-        """Patterns of the other axis, None where its code is not complete."""
-        other = Axis.ROW if self._axis is Axis.COLUMN else Axis.COLUMN
-        try:
-            return axis_patterns(self._wanted, self._name, other)
-        except PatternError:
-            return None
 
     def second_axis(
         self, curves: CameraCurves, frames: AxisFrames, calibration: Calibration
     ) -> SecondAxisResult | None:
         """Decode the other axis, if it was played. curves, frames : of the first, in the pixels of `part`."""
-        if self._second is None or self._second.missing:
+        if self._second is None or self._second.missing or self._second_patterns is None:
             return self._by_cross_lines(curves, frames, calibration)
         stacks, self._second = self._second, None
         if curves.gamma != 1:
             stacks.linearise(curves.gamma)
         frames = stacks.frames()
-        tables = _tables(axis_patterns(self._wanted, self._name, frames.axis), self._header.projector)
+        tables = _tables(self._second_patterns, self._header.projector)
         second = decode_second_axis(frames, curves.noise, tables, ReconstructionLimits().decoding)
         pairs = find_correspondences(curves.ensemble, second, self._axis)
         positions = second.positions
@@ -366,7 +361,7 @@ class _CameraFrames:
             positions = AxisPositions(*(self.part.placed(each, beyond=np.nan) for each in (
                 positions.position_px, positions.sigma_px
             )))  # fmt: skip
-        mine = axis_patterns(self._wanted, self._name, self._axis).gray
+        mine = self._patterns.gray
         codes = (mine, frames.gray) if self._axis is Axis.COLUMN else (frames.gray, mine)
         return SecondAxisResult(positions, pairs, codes)
 
@@ -387,7 +382,7 @@ class _CameraFrames:
         """(H, W): light of the lines of the other axis less the middle of white and black, summed over exposures."""
         sets = [] if self._cross_image is None else [(self._cross_image, frames.white, frames.black)]
         clipped_at = NEAR_SATURATION * min(frames.full_scale, float(self._header.cameras[self._name].full_scale))
-        for exposure_s in {shot.exposure_s for shot in self._kept}:
+        for exposure_s in dict.fromkeys(shot.exposure_s for shot in self._kept):
             shots = [shot for shot in self._kept if shot.exposure_s == exposure_s]
             images = [
                 [shot.image for shot in shots if self._header.patterns[shot.pattern] == wanted]

@@ -132,7 +132,7 @@ def read(path: Path, **options: Any) -> Calibration:
 
 
 def require_numbers(found: Calibration) -> None:
-    """The six arrays, whatever the frame of the world is."""
+    """The six arrays, in any frame of the world."""
     camera, projector = next(iter(found.cameras.values())), found.projector
     assert projector is not None
     assert (camera.size, projector.size) == (CAMERA, PROJECTOR)

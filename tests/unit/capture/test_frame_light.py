@@ -164,7 +164,7 @@ ONE_CHANGE = [CHANGES[0], *(pytest.param(*each, marks=pytest.mark.slow) for each
 def test_light_that_changes_is_no_fault(factor: Factor, is_exposure: bool, patterns: Sequence[Pattern]) -> None:
     found = summary(patterns, shots(patterns, factor, is_exposure=is_exposure))
     if patterns is SINGLE and factor is halves:
-        # A step among the lines cannot be told from damage of one of them.
+        # A step of light among the lines looks like damage of one of them.
         assert found.faults
         return
     assert found.faults == ()
