@@ -42,6 +42,7 @@ _FEW_EDGES, _HALF_LIT = -4.0, 0.22  # log2 per pixel; share of samples, of a pat
 _MIN_FACTOR_SHARE = 0.08  # of the lit samples, that tell the light of an image
 _MAX_HIDDEN = 3  # bits that are constant where there is light, or not resolved, at each end of a code
 _MISSING, _EXTRA, _WRONG, _EXCHANGED = 1.3, 1.6, 4.0, 1.8  # costs of an order of images
+_UNUSUAL = 4.0  # cost of bits neither from coarse to fine nor from fine to coarse: more than two exchanged images
 _MAX_COST = 6.0
 _CLEAR = 0.72  # swing of a bit, after which the next finer one is still resolved
 _MAX_WORSE = 1.2  # cost of an order over that of the best, that is kept
@@ -507,6 +508,23 @@ def _templates(
         for order in (axes, axes[::-1]) if mixed else (axes,):
             for template in _arrangements(order, numbers, both, mixed=mixed):
                 yield template, bits, prior
+        as_played = {axis: _as_played(images, axis, numbers[axis]) for axis in axes}
+        if as_played != numbers and not mixed:
+            for template in _arrangements(axes, as_played, both, mixed=False):
+                yield template, bits, prior + _UNUSUAL
+
+
+def _as_played(images: Sequence[_Image], axis: Axis, numbers: list[tuple[int, float]]) -> list[tuple[int, float]]:
+    """Return the bits of an axis in the order of their images; bits without one stay behind the next coarser one."""
+    first: dict[float, int] = {}
+    for index, image in enumerate(images):
+        if image.axis is axis and image.bit >= 0:
+            first.setdefault(image.bit, index)
+    at, places = -1, {}
+    for bit, place in numbers:
+        at = first.get(place, at)
+        places[bit] = at
+    return sorted(numbers, key=lambda each: places[each[0]])
 
 
 def _first_gap(images: Sequence[_Image], axis: Axis) -> int:

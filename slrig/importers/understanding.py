@@ -36,6 +36,7 @@ from slrig.patterns import gray_bits
 Names = Callable[[int], str]
 
 _MAX_READ = 6  # orders whose codes are placed on the projector
+_USUAL_ORDERS = ("coarse to fine", "fine to coarse")
 _PLAUSIBLE = 1.6  # cost of a reading, above which images may have been turned
 _MIN_SURENESS = 0.45
 _MAX_DISORDER = 2.2
@@ -294,10 +295,9 @@ def _describe(
         if place.mirrored:
             first, last = (1 << place.bits) - 1 - last, (1 << place.bits) - 1 - first
         start, end = first * place.cell_px - place.offset_px, (last + 1) * place.cell_px - 1 - place.offset_px
-        order = [each.bit for i in images_of if isinstance(each := found.patterns[i], Gray)]
         facts.append(
             f"{place.bits} bits of {axis}s, {'each with its inverse' if pairs else 'without inverses'}, "
-            f"{'fine to coarse' if order[0] > order[-1] else 'coarse to fine'}, cells of {place.cell_px} px"
+            f"{_bit_order(found.patterns, axis)}, cells of {place.cell_px} px"
             f"{f', offset {place.offset_px} px' if place.offset_px else ''}: {name(images_of[0])} to "
             f"{name(images_of[-1])}; {axis}s {max(start, 0)} to {min(end, projector.along(axis) - 1)} of "
             f"{projector.along(axis)} are visible"
@@ -313,6 +313,15 @@ def _describe(
                 f"the light of images differs by a factor of {spread:.2f}: automatic exposure or a lamp that follows "
                 "the picture; set a fixed exposure"
             )
+
+
+def _bit_order(patterns: Sequence[Pattern | None], axis: Axis) -> str:
+    bits = list(dict.fromkeys(each.bit for each in patterns if isinstance(each, Gray) and each.axis is axis))
+    if bits == sorted(bits):
+        return _USUAL_ORDERS[0]
+    if bits == sorted(bits, reverse=True):
+        return _USUAL_ORDERS[1]
+    return f"in the order {', '.join(map(str, bits))}"
 
 
 def _doubt(
@@ -368,6 +377,8 @@ def _doubt(
                 f"{place.bits} bits with cells of 1 px would end at {axis} {reach - 1}, the projector has "
                 f"{projector.along(axis)}: taken as cells of {place.cell_px} px; if they are others, state --cell-px"
             ))  # fmt: skip
+        if (text := _bit_order(found.patterns, axis)) not in _USUAL_ORDERS and not order.exchanged:
+            doubts.append(Doubt(f"the bits of {axis}s come {text}, by what they show: no program is known to do so"))
         if chains[axis].sureness < _MIN_SURENESS or reading.disorder[axis] > _MAX_DISORDER:
             doubts.append(
                 Doubt(f"the bits of {axis}s hardly nest as a Gray code does: too much noise, or another code")

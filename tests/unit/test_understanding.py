@@ -80,6 +80,18 @@ def test_orders_are_found_from_the_images(order: str) -> None:
     assert found.patterns == shown
 
 
+@pytest.mark.parametrize("inverses", [True, False])
+def test_bits_in_an_order_of_no_program_are_taken_for_what_they_show_and_doubted(*, inverses: bool) -> None:
+    columns = bits(Axis.COLUMN, inverses=inverses)
+    per_bit = 2 if inverses else 1
+    shown = [*ENDS, *(each for bit in (0, 1, 2, 6, 7, 5, 3, 4) for each in columns[per_bit * bit :][:per_bit])]
+    found = understood(photographed(shown))
+    assert found.patterns == shown
+    assert [doubt.text for doubt in found.doubts] == [
+        "the bits of columns come in the order 0, 1, 2, 6, 7, 5, 3, 4, by what they show: no program is known to do so"
+    ]
+
+
 def test_one_factor_of_light_per_image_is_free_and_named() -> None:
     shown = ORDERS["both axes, references last"]
     found = understood(photographed(shown, factors=[1 + 0.3 * np.sin(2.1 * place) for place in range(len(shown))]))
