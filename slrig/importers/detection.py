@@ -40,8 +40,15 @@ _TURNED = 0.8  # what a bit counts whose first image is another than those of th
 _MAX_WEIGHT = 15.0  # root of a number of edges: more are not surer
 _FEW_EDGES, _HALF_LIT = -4.0, 0.22  # log2 per pixel; share of samples, of a pattern that changes smoothly
 _MIN_FACTOR_SHARE = 0.08  # of the lit samples, that tell the light of an image
+_MIN_LIGHT = 0.03  # of lines on the samples that they light, over that of white
+_ABOVE_NOISE = 2.5  # standard deviations: fewer samples than that share have such noise
+_MIN_FACTOR = 0.5  # of images that tell the range of a pixel: half of them have more
+_CONTRAST = 3.0  # of the light of stripes and that between them
 _MAX_HIDDEN = 3  # bits that are constant where there is light, or not resolved, at each end of a code
 _MISSING, _EXTRA, _WRONG, _EXCHANGED = 1.3, 1.6, 4.0, 1.8  # costs of an order of images
+_DARK = 0.15  # level of an image of no light, and distance from 1 of white
+_UNEVEN, _APART = 1.6, 0.4  # cost over a difference of levels; least one of a constant bit and its inverse
+_MAX_CHANGES = 4  # of the axis in a sequence that plays one after the other
 _UNUSUAL = 4.0  # cost of bits neither from coarse to fine nor from fine to coarse: more than two exchanged images
 _MAX_COST = 6.0
 _CLEAR = 0.72  # swing of a bit, after which the next finer one is still resolved
@@ -90,21 +97,31 @@ def find_light(samples: Sequence[Light], *, trimmed: int = 1) -> Lit | None:
     skipped = min(trimmed if count > 5 else 0, (count - 2) // 2)
     factor, is_measured = np.ones(count), np.zeros(count, np.bool_)
     sigma = _noise(samples)
+    recorded: Light | None = None
     for least in _MIN_RANGE:
         even = stack / factor[:, None, None].astype(np.float32)
-        ordered = np.partition(even, (skipped, count - 1 - skipped), axis=0)
-        low, high = ordered[skipped], ordered[count - 1 - skipped]
+        # Blurred lines say little of the range, and much of their noise.
+        whole = even[factor > _MIN_FACTOR]
+        ordered = np.partition(whole, (skipped, len(whole) - 1 - skipped), axis=0)
+        low, high = ordered[skipped], ordered[len(whole) - 1 - skipped]
         span = high - low
-        top = float(np.percentile(span, 99))
-        strong, lit = ((span >= max(each * sigma, least * top, 1e-6)).all(axis=0) for each in _MIN_RANGE_SIGMAS)
+        recorded = span if recorded is None else recorded
+        # An image's factor also scales light of the room, which then changes where the projector lights nothing.
+        both = [(each, float(np.percentile(each, 99))) for each in (span, recorded)]
+        strong, lit = (
+            np.all([(each >= max(sigmas * sigma, least * top, 1e-6)).all(axis=0) for each, top in both], axis=0)
+            for sigmas in _MIN_RANGE_SIGMAS
+        )
         # The calmer samples tell more, unless they are a few bright spots.
         lit = strong if np.count_nonzero(strong) > _MIN_STRONG * np.count_nonzero(lit) else lit
         if np.count_nonzero(lit) < _MIN_LIT:
             return None
         light = (even[:, :, lit] - low[:, lit]) / span[:, lit]
-        found = _factors(light)
+        found = _factors(light, sigma / span[0, lit])
         is_measured = np.isfinite(found)
-        usual = float(np.median(found[is_measured])) if is_measured.any() else 1.0
+        # Lines are dimmer than bits.
+        bright = found[is_measured & (found > _MIN_FACTOR * np.nanmax(found))] if is_measured.any() else np.ones(1)
+        usual = float(np.median(bright))
         factor = factor * np.where(is_measured, found, usual) / usual
     slots = np.flatnonzero(lit).astype(np.int32)
     raw = (stack[:, 0, lit] - low[0, lit]) / span[0, lit]
@@ -121,14 +138,21 @@ def _noise(samples: Sequence[Light]) -> float:
     return max(0.3, float(np.percentile(rest, 25)))
 
 
-def _factors(light: Light) -> FloatArray:
-    """(n,) light of those samples that an image lights, NaN for images that light few or all."""
+def _factors(light: Light, noise: FloatArray) -> FloatArray:
+    """(n,) light of those samples that an image lights, NaN for images that light few or all. noise : (k,) its standard
+    deviation at each sample.
+    """
     found = np.full(len(light), np.nan)
-    for index, each in enumerate(light[:, 0]):
+    for index, planes in enumerate(light):
+        each = planes[0]
         top = float(np.percentile(each, 97))
-        bright, dark = each > max(0.5 * top, 0.12), each < 0.5 * top
-        if min(bright.mean(), dark.mean()) >= _MIN_FACTOR_SHARE:
-            found[index] = min(max(float(np.median(each[bright])), 0.25), 4.0)
+        level = np.maximum(max(0.5 * top, _MIN_LIGHT), _ABOVE_NOISE * noise)
+        bright, dark = each > level, each < 0.5 * top
+        if min(bright.mean(), dark.mean()) < _MIN_FACTOR_SHARE or _is_noise(planes, level):
+            continue
+        # Light of the room at another exposure is bright nowhere.
+        if np.median(each[bright]) > _CONTRAST * np.median(each[dark]):
+            found[index] = min(max(float(np.median(each[bright])), 2 * _MIN_LIGHT), 4.0)
     return found
 
 
@@ -209,9 +233,9 @@ def look_at(lit: Lit) -> Looks:
     return looks
 
 
-def _is_noise(planes: Light) -> bool:
-    """True if the minority of samples lies alone, in no direction next to another."""
-    sign = planes > 0.5
+def _is_noise(planes: Light, level: FloatArray | float = 0.5) -> bool:
+    """True if the minority of samples, below or above a level of light, lies alone, in no direction next to another."""
+    sign = planes > level
     share = float(sign[0].mean())
     apart = min(float((sign[0] != sign[plane]).mean()) for plane in (1, 2))
     return min(share, 1 - share) < _MAX_NOISY and apart > _ALONE * 2 * share * (1 - share)
@@ -283,7 +307,9 @@ def find_chain(units: Sequence[Unit], axis: Axis, *, direct_first: bool | None) 
     best = -math.inf
     while (found := max((_fitness(nesting, units, each, backward=backward), each) for each in _moved(order)))[0] > best:
         best, order = found
-    levels, polarity, sure = _numbered(nesting, order, direct_first=direct_first)
+    alone = [len(each.images) == 1 for each in units]
+    is_lone = [each and not all(alone) for each in alone]
+    levels, polarity, sure = _numbered(nesting, order, is_lone, direct_first=direct_first)
     common = nesting.shared[np.triu_indices(len(units), 1)]
     is_binary = len(units) > 3 and float(np.median(common)) > _TOGETHER
     return Chain(axis, tuple(units[k] for k in order), levels, polarity, sure, is_binary)
@@ -302,15 +328,18 @@ def _nesting(units: Sequence[Unit], plane: int) -> _Nesting:
     sign = np.stack([each.swing[[0, plane]] > 0 for each in units])
     edges = sign[:, 0] != sign[:, 1]
     # At steps in depth many bits change. Near any edge the finest bits may change too.
-    fine = np.argsort([each.density for each in units])[max(3, count - 2) :]
+    finest = np.argsort([each.density for each in units])[max(3, count - 2) :]
     found = _Nesting(*np.zeros((3, count, count)))
     for one, other in product(range(count), repeat=2):
-        rest = [k for k in range(count) if k not in (one, other) and k not in fine]
+        rest = [k for k in range(count) if k not in (one, other) and k not in finest]
         clean = edges[one] & ~edges[rest].any(axis=0)
         found.shared[one, other] = float(edges[other][edges[one]].mean()) if edges[one].any() else 0.0
         if one == other or (number := int(np.count_nonzero(clean))) < _MIN_EDGES:
             continue
-        swing = units[other].swing[[0, plane]][:, clean].mean(axis=0) / max(units[other].strength, 1e-6)
+        bit = units[other]
+        # A bit alone that the camera blurs is not around the middle between light and dark; half of it is lit.
+        middle = float(bit.swing[0].mean()) if len(bit.images) == 1 and bit.density > _FEW_EDGES else 0.0
+        swing = (bit.swing[[0, plane]][:, clean].mean(axis=0) - middle) / max(bit.strength, 1e-6)
         found.mean[one, other] = float(np.clip(swing, -1, 1).mean())
         found.weight[one, other] = math.sqrt(number)
     return found
@@ -335,9 +364,12 @@ def _fitness(nesting: _Nesting, units: Sequence[Unit], order: Sequence[int], *, 
 
 
 def _numbered(
-    nesting: _Nesting, order: Sequence[int], *, direct_first: bool | None
+    nesting: _Nesting, order: Sequence[int], is_lone: Sequence[bool], *, direct_first: bool | None
 ) -> tuple[tuple[int, ...], tuple[int, ...], float]:
-    """Return levels and polarity of bits in an order from coarse to fine, and their mean agreement with a Gray code."""
+    """Return levels and polarity of bits in an order from coarse to fine, and their mean agreement with a Gray code.
+
+    is_lone : of a bit without the inverse that others have, so that it may be the inverse.
+    """
     levels, polarity = [0], [0]
     agreement = weights = 0.0
     for finer in range(1, len(order)):
@@ -352,7 +384,12 @@ def _numbered(
             value = float(np.sum(weight * expected * mean) / weight.sum())
             if abs(value) > abs(vote) + 0.15:
                 vote, jump = value, tried
-        if not weight[:-1].any() and direct_first is not None and vote * (1 if direct_first else -1) < -_SURE:
+        if (
+            not weight[:-1].any()
+            and not is_lone[order[finer]]
+            and direct_first is not None
+            and vote * (1 if direct_first else -1) < -_SURE
+        ):
             vote, jump = -vote, 2
         levels.append(levels[-1] + jump)
         polarity.append(0 if abs(vote) < _SURE else 1 if vote > 0 else -1)
@@ -444,12 +481,38 @@ def find_orders(images: Sequence[_Image], levels: CodeLevels, turns: Sequence[in
             if not math.isfinite(cost):
                 continue
             back = tuple(shows[(place + turned) % len(images)] for place in range(len(images)))
-            # White without black, or black without white, is rarer than both or neither.
-            lone = 0.25 * (("white" in back) != ("black" in back))
+            # More white than black images, or fewer, are rarer than as many.
+            lone = 0.25 * (back.count("white") != back.count("black"))
+            lone += _UNEVEN * _unevenness(images, back)
             strays = tuple((place - turned) % len(images) for place in exchanged)
             found.append(Order(back, bits, cost + prior + lone + 0.9 * abs(turned), turned, missing, strays))
             found += _other_halves(found[-1], images)
             found.sort(key=lambda each: each.cost)
+    return found
+
+
+def _unevenness(images: Sequence[_Image], shows: Sequence[CodeBit | str | None]) -> float:
+    """Return how far levels of flat images are from those that they should have beside each other.
+
+    White images have equal ones, black images too, and a bit and its inverse that are not resolved. A bit that is
+    constant and its inverse are far apart.
+    """
+    levels: dict[object, list[float]] = {}
+    resolved: dict[Axis, list[int]] = {}
+    for image, shown in zip(images, shows, strict=True):
+        if isinstance(shown, CodeBit):
+            if image.bit >= 0:
+                resolved.setdefault(shown.axis, []).append(shown.bit)
+            elif math.isfinite(image.level):
+                levels.setdefault((shown.axis, shown.bit), []).append(image.level)
+        elif shown is not None:
+            levels.setdefault(shown, []).append(image.level)
+    found = 0.0
+    for key, values in levels.items():
+        apart = max(values) - min(values)
+        is_coarse = isinstance(key, tuple) and key[1] < min(resolved.get(key[0], [0]))
+        if len(values) > 1:
+            found += max(0.0, _APART - apart) if is_coarse else apart
     return found
 
 
@@ -476,8 +539,9 @@ def _templates(
     places = {axis: [i for i, each in enumerate(images) if each.axis is axis and each.bit >= 0 and each.is_first]
               for axis in resolved}  # fmt: skip
     axes = sorted(resolved, key=lambda axis: np.median(places[axis]))
-    spans = [places[axis] for axis in axes]
-    mixed = len(axes) == 2 and max(spans[0]) > min(spans[1]) + 1
+    # A bit that is missing or moved may stand alone among those of the other axis.
+    sequence = [axis for _, axis in sorted((place, axis) for axis in axes for place in places[axis])]
+    mixed = sum(one is not other for one, other in pairwise(sequence)) > _MAX_CHANGES
     rising = sum(_trend(images, axis) for axis in axes) >= 0
     spare = sum(1 for each in images if each.bit < 0)
     each_takes = 2 if levels.pairs else 1
@@ -496,6 +560,8 @@ def _templates(
             continue
         bits = {axis: resolved[axis] + sum(each) for axis, each in zip(axes, hidden, strict=True)}
         prior = sum(_prior(bits[a], full[a], levels.finest[a], each) for a, each in zip(axes, hidden, strict=True))
+        # Some programs give both axes the bits of the longer one; more than that are of no projector.
+        prior += sum(count > max(full[axis] for axis in axes) for axis, count in bits.items())
         numbers: dict[Axis, list[tuple[int, float]]] = {}
         for axis, (coarse, more, _) in zip(axes, hidden, strict=True):
             every = list(range(bits[axis]))
@@ -575,7 +641,11 @@ def _mismatch(image: _Image, bit: CodeBit, place: float, resolved: dict[Axis, se
     is_coarse = not is_fine and place not in resolved[bit.axis]
     if math.isfinite(image.level):
         ends, middle = min(abs(image.level), abs(1 - image.level)), abs(image.level - 0.5)
-        return 0.1 + 0.8 * ends if is_coarse else 0.1 + 0.8 * middle if is_fine else _WRONG
+        # Stripes that the camera does not resolve are neither dark nor as bright as white; of the finest bit that it
+        # does, one of two images may be so.
+        blurred = 0.1 + 0.8 * middle + (0.0 if ends > _DARK else _EXTRA)
+        is_finest = place == max(resolved[bit.axis])
+        return 0.1 + 0.8 * ends if is_coarse else blurred if is_fine else 0.2 + blurred if is_finest else _WRONG
     turned = bool(image.polarity) and image.polarity != (-1 if bit.inverted else 1)
     if image.is_loose:
         return 0.1 + 0.6 * turned if is_coarse else _WRONG

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -17,12 +17,13 @@ from slrig.importers.detection import Light, sample_image
 from slrig.importers.images import ENDINGS, SourceImage, list_images
 from slrig.importers.orders import pattern_words
 from slrig.importers.understanding import Understanding, understand
-from slrig.model import CameraFormat, Pattern, Pixels, Size
+from slrig.model import CameraFormat, Gray, Pattern, Pixels, Size
 
 _MIN_IMAGES = 4
 _MAX_CAMERAS = 16
 _MAX_GROUPINGS = 8
 _GOOD_COST = 1.0
+_OTHER_CODES = 2.0  # cost of cameras that see different codes: likelier one camera's images of both axes
 _THUMBNAIL_PX = 168
 
 Groups = dict[str, list[SourceImage]]
@@ -52,6 +53,8 @@ class UnderstoodFolder:
         several = len(self.cameras) > 1
         found = [f"{name}: {doubt.text}" if several else doubt.text
                  for name, (_, each) in self.cameras.items() for doubt in each.doubts]  # fmt: skip
+        if not self._is_one_code:
+            found.append(f"{', '.join(self.cameras)} show different codes: they may be one camera's images")
         return list(dict.fromkeys(found))
 
     @property
@@ -84,8 +87,17 @@ class UnderstoodFolder:
 
     @property
     def cost(self) -> float:
-        """How unlike a capture this is: of the worst camera."""
-        return max(each.cost + 0.5 * len(each.left_out) for _, each in self.cameras.values())
+        """How unlike a capture this is: of the worst camera. Cameras see the same patterns."""
+        worst = max(each.cost + 0.5 * len(each.left_out) for _, each in self.cameras.values())
+        return worst + (0.0 if self._is_one_code else _OTHER_CODES)
+
+    @property
+    def _is_one_code(self) -> bool:
+        codes = {
+            frozenset(replace(shown, bit=0, inverted=False) for shown in each.patterns if isinstance(shown, Gray))
+            for _, each in self.cameras.values()
+        }
+        return len(codes) == 1
 
 
 def list_subfolders(folder: Path) -> tuple[Groups, list[str]]:

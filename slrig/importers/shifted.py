@@ -13,6 +13,7 @@ from slrig.importers.detection import Lit, Looks, Mask, Unit
 from slrig.model import MIN_LINE_STEPS, Axis, FloatArray, LineShift, Sine
 
 _SAME_DENSITY = 0.4  # octaves
+_NEAR_DENSITY = 0.8  # octaves, of patterns that come next to those of one period
 _MAX_SPREAD = 1.5  # octaves, of lines of one period
 _FINE = -5.5  # log2 of edges per pixel: coarser bits may have equally many by chance
 _WINDOW, _MAX_WINDOW, _CELLS = 5, 61, 2.0  # samples and cells, over which the position of cells is averaged
@@ -38,13 +39,16 @@ def shifted_units(looks: Looks) -> list[list[Unit]]:
     for axis in Axis:
         # Inverses stand apart as far as those of bits do, or of lines of half their period.
         own = [u for u in looks.units if u.axis is axis and u.density > _FINE and _gap(u) not in of_bits]
-        run: list[Unit] = []
+        runs: list[list[Unit]] = [[]]
         for unit in sorted(own, key=lambda each: each.density):
-            if run and unit.density - run[0].density > _SAME_DENSITY:
-                groups.append(run)
-                run = []
-            run.append(unit)
-        groups.append(run)
+            if runs[-1] and unit.density - runs[-1][0].density > _SAME_DENSITY:
+                # Noise adds edges where there is little light: patterns of one period come one after the other.
+                if _continues(unit, runs[-1]):
+                    runs[-1].append(unit)
+                    continue
+                runs.append([])
+            runs[-1].append(unit)
+        groups += runs
     found = [run for run in groups if len(run) > 1 and sum(len(each.images) for each in run) >= MIN_LINE_STEPS]
     for run in found:
         # What the camera hardly resolves stands between the others.
@@ -52,6 +56,12 @@ def shifted_units(looks: Looks) -> list[list[Unit]]:
         known = [unit for group in found for unit in group]
         run += [u for u in looks.units if u not in known and first < u.images[0] <= u.images[-1] < last]
     return found
+
+
+def _continues(unit: Unit, run: Sequence[Unit]) -> bool:
+    first, last = min(each.images[0] for each in run), max(each.images[-1] for each in run)
+    near = first - 1 <= unit.images[0] <= unit.images[-1] <= last + 1
+    return len(run) > 1 and near and unit.density - run[0].density <= _NEAR_DENSITY
 
 
 def _gap(unit: Unit) -> int:

@@ -37,6 +37,8 @@ Names = Callable[[int], str]
 
 _MAX_READ = 6  # orders whose codes are placed on the projector
 _USUAL_ORDERS = ("coarse to fine", "fine to coarse")
+_MAX_PHOTOGRAPHS = 2
+_LINES_FIT = 1.0  # cost of a reading over the best, that lines of a period of its code outweigh
 _PLAUSIBLE = 1.6  # cost of a reading, above which images may have been turned
 _MIN_SURENESS = 0.45
 _MAX_DISORDER = 2.2
@@ -94,9 +96,12 @@ def understand(
     width = samples[0].shape[2]
     groups = shifted_units(looks)
     shifted = {image for group in groups for unit in group for image in unit.images}
-    code = replace_units(looks, [unit for unit in looks.units if unit.images[0] not in shifted])
+    smooth = [unit for unit in looks.units if unit.is_smooth and unit.images[0] not in shifted]
+    # One or two images without stripes are photographs of the scene, not bits.
+    photographs = {unit.images[0] for unit in smooth if len(unit.images) == 1 and len(smooth) <= _MAX_PHOTOGRAPHS}
+    outside = shifted | photographs
+    code = replace_units(looks, [unit for unit in looks.units if unit.images[0] not in outside])
     chains, direct_first, pairs = _chains(code)
-    smooth = [unit for unit in code.units if unit.is_smooth]
     if not chains or 2 * len(smooth) > sum(len(chain.units) for chain in chains.values()):
         raise BundleError(_nothing_found(looks, len(samples)))
     for axis, chain in chains.items():
@@ -106,8 +111,16 @@ def understand(
                 "edges tell positions between pixels; record a Gray code"
             )
     readings = _read(
-        lit, code, chains, projector, leave=shifted, direct_first=direct_first, pairs=pairs, hints=(cell_px, offset_px)
+        lit, code, chains, projector, leave=outside, direct_first=direct_first, pairs=pairs, hints=(cell_px, offset_px)
     )
+    if groups:
+        near = [each for each in readings if each.cost < readings[0].cost + _LINES_FIT]
+        fits = [
+            all(_lines(lit, group, looks, each, chains, projector, width) is not None for group in groups)
+            for each in near
+        ]
+        best = fits.index(True) if True in fits else 0
+        readings = [readings[best], *readings[:best], *readings[best + 1 :]]
     for group in groups:
         lines = _lines(lit, group, looks, readings[0], chains, projector, width)
         if lines is not None and lines.is_reversed:
@@ -383,6 +396,19 @@ def _doubt(
             doubts.append(
                 Doubt(f"the bits of {axis}s hardly nest as a Gray code does: too much noise, or another code")
             )
+    striped = {
+        (each.axis, each.bit) for i, each in enumerate(found.patterns) if isinstance(each, Gray) and i not in looks.flat
+    }
+    for index in looks.flat:
+        shown = found.patterns[index]
+        if isinstance(shown, Gray) and (shown.axis, shown.bit) in striped:
+            text = f"{name(index)} shows no stripes: by its place it is {shown.axis} bit {shown.bit}"
+            doubts.append(Doubt(text + (", inverse" if shown.inverted else ""), (index,)))
+    flat = {kind: [i for i, each in enumerate(found.patterns) if each == kind] for kind in (White(), Black())}
+    lone = [(kind.kind, images[0]) for kind, images in flat.items() if images]
+    if len(lone) == 1:
+        (kind, image), other = lone[0], "black" if flat[White()] else "white"
+        doubts.append(Doubt(f"{name(image)} is taken for {kind}, and no image for {other}", (image,)))
     strange = [i for i, each in enumerate(found.patterns) if each is None and i not in found.left_out]
     found.left_out |= dict.fromkeys(strange, "fits no pattern of the set")
     if strange:

@@ -95,9 +95,9 @@ STAND_INS = (
     ),
     StandIn(
         "slrig import teapot --projector 1024x768 --output teapot-bundle",
-        "mkdir teapot && sed '2a [scan]\\nline_shift = false\\ngray_cell_px = 4' config/rigs/demo.toml "
+        "mkdir teapot && sed '2a [scan]\\nline_shift = false\\ngray_cell_px = 2' config/rigs/demo.toml "
         "> config/rigs/codes.toml && slrig demo config/rigs/codes.toml --output codes "
-        "&& cp codes/service/scans/*/bundle/frames/left/00?.png codes/service/scans/*/bundle/frames/left/01[0-3].png "
+        "&& cp codes/service/scans/*/bundle/frames/left/00?.png codes/service/scans/*/bundle/frames/left/01[0-5].png "
         "codes/service/scans/*/bundle/calibration.json teapot "
         "&& slrig import teapot --projector 256x192 --camera left --yes --output teapot-bundle",
         "the demonstration in Gray code alone, in smaller pictures, takes the place of another program's images",
