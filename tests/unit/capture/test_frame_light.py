@@ -200,8 +200,12 @@ def garbled(images: list[Pixels], index: int) -> Pixels:
 
 
 @pytest.mark.parametrize(("factor", "is_exposure"), ONE_CHANGE)
-@pytest.mark.parametrize("index", [FIRST_BIT, FIRST_BIT + 1, FIRST_LINE, FIRST_LINE + 5])
-@pytest.mark.parametrize("spoil", [stale, dark, garbled])
+@pytest.mark.parametrize(
+    ("spoil", "index"),
+    [(stale, FIRST_BIT), (dark, FIRST_BIT + 1), (stale, FIRST_LINE + 5), (garbled, FIRST_LINE),
+     *(pytest.param(spoil, index, marks=pytest.mark.slow) for spoil in (stale, dark, garbled)
+       for index in (FIRST_BIT, FIRST_BIT + 1, FIRST_LINE, FIRST_LINE + 5))],
+)  # fmt: skip
 def test_a_wrong_frame_is_found_in_light_that_changes(
     spoil: Callable[[list[Pixels], int], Pixels], index: int, factor: Factor, is_exposure: bool
 ) -> None:
