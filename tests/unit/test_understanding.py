@@ -32,9 +32,7 @@ def photographed(
 ) -> list[Pixels]:
     """Images of patterns, blurred by the size of a pixel; factors : of the light of each."""
     column, row, albedo = screen(camera)
-    lit = (np.hypot(*(np.mgrid[: camera[0], : camera[1]] - np.array(camera)[:, None, None] / 2)) < 130).astype(
-        np.float64
-    )
+    lit = np.hypot(*(np.mgrid[: camera[0], : camera[1]] - np.array(camera)[:, None, None] / 2)) < 130
     rng, images = np.random.default_rng(3), []
     for place, pattern in enumerate(patterns):
         light = pattern_light(pattern, PROJECTOR).astype(np.float64) / 255
