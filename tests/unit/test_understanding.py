@@ -71,9 +71,13 @@ ORDERS: dict[str, list[Pattern]] = {
     "centred": [*ENDS, *bits(Axis.COLUMN, offset=28), *bits(Axis.ROW, offset=90)],
     "lines": [*ENDS, *bits(Axis.COLUMN, cell=4), *LINES],
 }
+WITH_A_TWIN = ("both axes, references last", "inverses after all bits", "wider cells")
+"""Their images are in another test of this file, too, or in tests of imported folders."""
 
 
-@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize(
+    "order", [pytest.param(each, marks=[pytest.mark.slow] * (each in WITH_A_TWIN)) for each in ORDERS]
+)
 def test_orders_are_found_from_the_images(order: str) -> None:
     shown = ORDERS[order]
     found = understood(photographed(shown, noise=4.0))
@@ -123,7 +127,10 @@ def test_a_bit_without_any_image_is_named() -> None:
         understood(photographed([*shown[:3], *shown[4:]]))
 
 
-@pytest.mark.parametrize("rest", [[], LINES, ROWS], ids=["alone", "lines", "rows"])
+@pytest.mark.parametrize(
+    "rest",
+    [pytest.param([], id="alone"), *(pytest.param(each, marks=pytest.mark.slow) for each in (LINES, ROWS))],
+)
 def test_a_code_with_an_inverted_first_bit_is_mirrored(rest: list[Pattern]) -> None:
     code = bits(Axis.COLUMN, inverses=True)
     played: list[Pattern] = [*ENDS, *code, *rest]
@@ -134,7 +141,9 @@ def test_a_code_with_an_inverted_first_bit_is_mirrored(rest: list[Pattern]) -> N
     assert any("the code of columns is mirrored" in doubt.text for doubt in found.doubts)
 
 
-@pytest.mark.parametrize(("cell", "period", "steps"), [(16, 16.0, 4), (16, 16.0, 3), (8, 32.0, 8)])
+@pytest.mark.parametrize(
+    ("cell", "period", "steps"), [(16, 16.0, 4), pytest.param(16, 16.0, 3, marks=pytest.mark.slow), (8, 32.0, 8)]
+)
 def test_sinusoids_beside_a_code_are_named(cell: int, period: float, steps: int) -> None:
     shown = [*ENDS, *bits(Axis.COLUMN, cell=cell), *(Sine(Axis.COLUMN, period, k, steps) for k in range(steps))]
     assert understood(photographed(shown)).patterns == shown

@@ -206,9 +206,9 @@ ENDS = (White(), Black())
 
 @pytest.mark.parametrize(
     "patterns",
-    [(*ENDS, *CODE, *FOUR_STEPS), (*CODE, *FOUR_STEPS), played((16.0, 4), (128 / 7, 4)),
-     (*ENDS, *played((16.0, 3), (128.0, 3)))],
-    ids=["white, black, Gray", "Gray", "two periods", "2x3 with white and black"],
+    [pytest.param((*ENDS, *CODE, *FOUR_STEPS), id="white, black, Gray", marks=pytest.mark.slow),
+     pytest.param((*CODE, *FOUR_STEPS), id="Gray"), pytest.param(played((16.0, 4), (128 / 7, 4)), id="two periods"),
+     pytest.param((*ENDS, *played((16.0, 3), (128.0, 3))), id="2x3 with white and black", marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_curves_of_sinusoids_lie_at_their_projector_positions(patterns: tuple[Pattern, ...]) -> None:
     x, y = grid((45, 200))

@@ -117,6 +117,7 @@ def test_a_pair_along_the_stripes_is_passed_over_however_many_points_it_gives() 
     assert triangulate([first, above], None, Axis.COLUMN).baseline_sine < 0.2
 
 
+@pytest.mark.slow
 def test_of_pairs_across_the_stripes_the_one_with_most_points_is_used() -> None:
     first = seen("first", CAMERA, curves_in(CAMERA, MANY))
     few = seen("few", OTHER_CAMERA, curves_in(OTHER_CAMERA, FEW))

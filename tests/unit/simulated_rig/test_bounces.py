@@ -79,7 +79,8 @@ def form_factor(point: FloatArray, normal: FloatArray, corners: Sequence[FloatAr
     return float(abs(normal @ total) / (2 * np.pi))
 
 
-@pytest.mark.parametrize("opening_deg", [60.0, *(pytest.param(each, marks=pytest.mark.slow) for each in (90.0, 130.0))])
+@pytest.mark.slow
+@pytest.mark.parametrize("opening_deg", [60.0, 90.0, 130.0])
 def test_walls_of_a_groove_light_each_other_by_their_form_factor(tmp_path: Path, opening_deg: float) -> None:
     head = small_head(tmp_path, groove(opening_deg), projector=SUN)
     light = scattered(head).irradiance(table(head, WHITE))
