@@ -107,11 +107,12 @@ def pytest_configure_node(node: WorkerController) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Iterator[None]:
-    """Look for cycles among new objects only, once all tests are imported."""
+    """Look for cycles among new objects only, and rarely, once all tests are imported."""
     try:
         return (yield)
     finally:
         gc.freeze()
+        gc.set_threshold(50_000, 20, 20)
         gc.enable()
 
 

@@ -377,9 +377,10 @@ def by_hand(images: list[Pixels], kind: str) -> list[Pixels]:
         pytest.param("noise", "", marks=pytest.mark.slow),
         pytest.param("copy", "image graycode_07.png is a copy of image graycode_06.png", marks=pytest.mark.slow),
         ("exchanged", "image graycode_15.png and image graycode_17.png are exchanged"),
-        (
+        pytest.param(
             "first to the end",
             "all frames are one frame ahead of their patterns: with the last frame moved to the front",
+            marks=pytest.mark.slow,
         ),
     ],
 )

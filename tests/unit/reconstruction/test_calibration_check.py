@@ -180,6 +180,7 @@ def test_mistake_refutes_the_calibration_and_is_named(pairs: PixelPairs, mistake
     assert cause in found.cause
 
 
+@pytest.mark.slow
 def test_unrelated_pixels_are_refuted_without_a_cause(pairs: PixelPairs) -> None:
     order = np.random.default_rng(1).permutation(len(pairs))
 
