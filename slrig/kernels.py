@@ -9,6 +9,7 @@ fails at sums over nested loops), and the threads of GNU OpenMP busy-wait.
 from __future__ import annotations
 
 import ctypes
+import gc
 import glob
 import hashlib
 import os
@@ -94,6 +95,21 @@ def report_compilations(report: Callable[[str], None]) -> Iterator[None]:
         yield
     finally:
         event.unregister("numba:compile", listener)
+
+
+@contextmanager
+def rare_garbage_collection() -> Iterator[None]:
+    """Search for reference cycles less often while kernels are compiled.
+
+    The compiler makes millions of objects that live on. Searching through them at Python's usual rate takes a good part
+    of the time and frees next to nothing.
+    """
+    usual = gc.get_threshold()
+    gc.set_threshold(50_000, 20, 20)
+    try:
+        yield
+    finally:
+        gc.set_threshold(*usual)
 
 
 def in_bands(

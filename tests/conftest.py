@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import subprocess
@@ -36,8 +37,12 @@ NEED_KERNELS = (
 
 _KERNELS_LOCK = pytest.StashKey[str]()
 
+# Importing and rewriting all tests makes millions of objects that live to the end: looking for cycles among them, again
+# and again, takes a third of the time.
+gc.disable()
+
 # The same draws every time, so that a run fails by the change it tests; --hypothesis-profile=default draws afresh.
-settings.register_profile("repeatable", derandomize=True)
+settings.register_profile("repeatable", derandomize=True, deadline=None)  # other processes may take the time
 settings.load_profile("repeatable")
 
 
@@ -98,6 +103,17 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 def pytest_configure_node(node: WorkerController) -> None:
     """Pass a process of tests the lock that is held while kernels compile."""
     node.workerinput["kernels_lock"] = node.config.stash.get(_KERNELS_LOCK, "")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Look for cycles among new objects only, and rarely, once all tests are imported."""
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.set_threshold(50_000, 20, 20)
+        gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

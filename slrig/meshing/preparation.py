@@ -12,6 +12,7 @@ import threading
 
 import numpy as np
 
+from slrig.kernels import rare_garbage_collection
 from slrig.meshing.facing import Viewpoints
 from slrig.meshing.quality import mesh_figures
 from slrig.meshing.surface import MeshingLimits, build_surface
@@ -52,4 +53,5 @@ def _end_with_input() -> None:
 
 if __name__ == "__main__":
     threading.Thread(target=_end_with_input, daemon=True).start()
-    mesh_sample()
+    with rare_garbage_collection():
+        mesh_sample()

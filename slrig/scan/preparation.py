@@ -21,7 +21,7 @@ from numba import config
 
 from slrig.bundle import write_bundle
 from slrig.errors import StorageError
-from slrig.kernels import KernelCount, count_prepared, report_compilations
+from slrig.kernels import KernelCount, count_prepared, rare_garbage_collection, report_compilations
 from slrig.meshing import FIRST_STAGE
 from slrig.model import Calibration, CameraFormat, Capture, FloatArray, Pinhole, Pixels, Shot, Size
 from slrig.patterns import encode, scan_patterns
@@ -42,7 +42,7 @@ def prepare_kernels(reconstruct: Callable[..., Any], told: Callable[[KernelCount
     reconstruct : `slrig.scan.reconstruct.reconstruct_bundle`. `told` hears how far that is, once for every kernel or
     part of one that has to be compiled, on the thread that compiles it.
     """
-    with _MeshingCompiler() as beside:
+    with rare_garbage_collection(), _MeshingCompiler() as beside:
 
         def compiling(_: str) -> None:
             beside.start()

@@ -249,10 +249,10 @@ def test_the_unit_of_a_calibration_is_asked_and_taken(tmp_path: Path) -> None:
     lens, straight = np.array([[80.0, 0, 19.4], [0, 80, 15.4], [0, 0, 1]]), np.zeros((1, 5))
     shift = np.array([[-0.1], [0], [0]])
     opencv_file(folder / "calibration.yml", SCAN3D, [lens, straight, lens, straight, np.eye(3), shift, np.eye(3)])
-    result = run(folder, "--output", tmp_path / "bundle", "--projector", "200x160")
+    result = run(folder, "--output", tmp_path / "bundle", "--projector", "200x160", "--format", "opencv")
     assert result.exit_code == 2
     assert "stand 0.1 mm apart (--unit mm). Metres?" in " ".join(result.stderr.split())
-    calibration = read_bundle(imported(folder, tmp_path / "bundle", "--unit", "m")).calibration
+    calibration = read_bundle(imported(folder, tmp_path / "bundle", "--unit", "m", "--format", "opencv")).calibration
     assert calibration is not None
     assert calibration.projector is not None
     np.testing.assert_allclose(calibration.projector.translation_mm, (-100, 0, 0))
@@ -373,13 +373,14 @@ def by_hand(images: list[Pixels], kind: str) -> list[Pixels]:
 @pytest.mark.parametrize(
     ("kind", "words"),
     [
-        ("right", ""),
-        ("noise", ""),
-        ("copy", "image graycode_07.png is a copy of image graycode_06.png"),
+        pytest.param("right", "", marks=pytest.mark.slow),
+        pytest.param("noise", "", marks=pytest.mark.slow),
+        pytest.param("copy", "image graycode_07.png is a copy of image graycode_06.png", marks=pytest.mark.slow),
         ("exchanged", "image graycode_15.png and image graycode_17.png are exchanged"),
-        (
+        pytest.param(
             "first to the end",
             "all frames are one frame ahead of their patterns: with the last frame moved to the front",
+            marks=pytest.mark.slow,
         ),
     ],
 )

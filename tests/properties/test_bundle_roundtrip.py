@@ -114,7 +114,7 @@ def _solved_calibrations(draw: st.DrawFn) -> Calibration:
     return replace(calibration, solved=solved)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(_captures())
 def test_a_bundle_comes_back_as_it_was_written(capture: Capture) -> None:
     with tempfile.TemporaryDirectory() as folder:

@@ -220,7 +220,7 @@ def sequence_of(fake: FakeRig) -> PatternSequence:
     return encode((White(), Black(), *bits), fake.projector.size)
 
 
-@pytest.mark.parametrize("exposures_s", [(None,), (0.01, 0.0401, 0.04)])
+@pytest.mark.parametrize("exposures_s", [pytest.param((None,), marks=pytest.mark.slow), (0.01, 0.0401, 0.04)])
 def test_white_and_black_in_colour_reach_the_place_where_a_mesh_is_made(exposures_s: tuple[float | None, ...]) -> None:
     fake = fake_rig(noise_dn=0.5)
     scene, sequence = fake.cameras["left"].scene, sequence_of(fake)

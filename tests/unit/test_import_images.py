@@ -207,8 +207,10 @@ def test_colour_in_a_video_and_in_an_array_is_kept_of_white_and_black(tmp_path: 
         assert np.array_equal(kept, coloured[WHITE])
 
 
-@pytest.mark.parametrize("held", [3, 6])
-@pytest.mark.parametrize("noise_dn", [0.0, 3.0])
+@pytest.mark.parametrize(
+    ("held", "noise_dn"),
+    [(3, 3.0), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((3, 0.0), (6, 0.0), (6, 3.0)))],
+)
 def test_a_video_that_holds_each_pattern_is_averaged(tmp_path: Path, held: int, noise_dn: float) -> None:
     chance = np.random.default_rng(4)
     images, frames = photographed(), []

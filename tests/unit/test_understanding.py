@@ -14,37 +14,37 @@ from slrig.importers.understanding import Understanding, understand
 from slrig.model import Axis, Black, FloatArray, Gray, LineShift, Pattern, Pixels, Sine, Size, White
 from tests.rendered_folders import pattern_light
 
-PROJECTOR = Size(200, 150)
-CAMERA = (210, 280)
+PROJECTOR = Size(200, 75)
+CAMERA = (105, 280)
 ENDS: list[Pattern] = [White(), Black()]
 
 
-def screen() -> tuple[FloatArray, FloatArray, FloatArray]:
+def screen(camera: tuple[int, int]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Projector column and row at each pixel of a bent screen, and its albedo: the middle of the light."""
-    y, x = np.mgrid[: CAMERA[0], : CAMERA[1]].astype(np.float64)
+    y, x = np.mgrid[: camera[0], : camera[1]].astype(np.float64)
     column = 18 + 0.6 * x + 3 * np.sin(y / 35) + 0.02 * y
     row = 12 + 0.6 * y + 2 * np.sin(x / 50)
     return column, row, 0.65 + 0.3 * np.sin(x / 17) * np.cos(y / 23)
 
 
-def photographed(patterns: Sequence[Pattern], *, noise: float = 1.0, factors: Sequence[float] = ()) -> list[Pixels]:
+def photographed(
+    patterns: Sequence[Pattern], *, noise: float = 1.0, factors: Sequence[float] = (), camera: tuple[int, int] = CAMERA
+) -> list[Pixels]:
     """Images of patterns, blurred by the size of a pixel; factors : of the light of each."""
-    column, row, albedo = screen()
-    lit = (np.hypot(*(np.mgrid[: CAMERA[0], : CAMERA[1]] - np.array([105, 140])[:, None, None])) < 130).astype(
-        np.float64
-    )
+    column, row, albedo = screen(camera)
+    lit = np.hypot(*(np.mgrid[: camera[0], : camera[1]] - np.array(camera)[:, None, None] / 2)) < 130
     rng, images = np.random.default_rng(3), []
     for place, pattern in enumerate(patterns):
         light = pattern_light(pattern, PROJECTOR).astype(np.float64) / 255
         steps = np.linspace(-0.4, 0.4, 5)
         if light.size == 1:
-            value = np.full(CAMERA, light[0, 0])
+            value = np.full(camera, light[0, 0])
         else:
             at = column if light.shape[0] == 1 else row
             flat = light.ravel()
             value = np.mean([flat[np.clip(np.rint(at + step), 0, len(flat) - 1).astype(int)] for step in steps], axis=0)
         image = (8 + 170 * value * albedo * lit) * (factors[place] if len(factors) else 1.0)
-        images.append(np.clip(image + rng.normal(0, noise, CAMERA), 0, 255).astype(np.uint8))
+        images.append(np.clip(image + rng.normal(0, noise, camera), 0, 255).astype(np.uint8))
     return images
 
 
@@ -68,12 +68,16 @@ ORDERS: dict[str, list[Pattern]] = {
     "axes mixed": [*ENDS, *(each for k in range(8) for axis in (COLUMNS, ROWS) for each in axis[2 * k : 2 * k + 2])],
     "neither white nor black nor inverses": list(bits(Axis.COLUMN, inverses=False)),
     "wider cells": [*ENDS, *bits(Axis.COLUMN, cell=2)],
-    "centred": [*ENDS, *bits(Axis.COLUMN, offset=28), *bits(Axis.ROW, offset=53)],
+    "centred": [*ENDS, *bits(Axis.COLUMN, offset=28), *bits(Axis.ROW, offset=90)],
     "lines": [*ENDS, *bits(Axis.COLUMN, cell=4), *LINES],
 }
+WITH_A_TWIN = ("both axes, references last", "inverses after all bits", "wider cells")
+"""Their images are in another test of this file, too, or in tests of imported folders."""
 
 
-@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize(
+    "order", [pytest.param(each, marks=[pytest.mark.slow] * (each in WITH_A_TWIN)) for each in ORDERS]
+)
 def test_orders_are_found_from_the_images(order: str) -> None:
     shown = ORDERS[order]
     found = understood(photographed(shown, noise=4.0))
@@ -123,7 +127,10 @@ def test_a_bit_without_any_image_is_named() -> None:
         understood(photographed([*shown[:3], *shown[4:]]))
 
 
-@pytest.mark.parametrize("rest", [[], LINES, ROWS], ids=["alone", "lines", "rows"])
+@pytest.mark.parametrize(
+    "rest",
+    [pytest.param([], id="alone"), *(pytest.param(each, marks=pytest.mark.slow) for each in (LINES, ROWS))],
+)
 def test_a_code_with_an_inverted_first_bit_is_mirrored(rest: list[Pattern]) -> None:
     code = bits(Axis.COLUMN, inverses=True)
     played: list[Pattern] = [*ENDS, *code, *rest]
@@ -134,7 +141,9 @@ def test_a_code_with_an_inverted_first_bit_is_mirrored(rest: list[Pattern]) -> N
     assert any("the code of columns is mirrored" in doubt.text for doubt in found.doubts)
 
 
-@pytest.mark.parametrize(("cell", "period", "steps"), [(16, 16.0, 4), (16, 16.0, 3), (8, 32.0, 8)])
+@pytest.mark.parametrize(
+    ("cell", "period", "steps"), [(16, 16.0, 4), pytest.param(16, 16.0, 3, marks=pytest.mark.slow), (8, 32.0, 8)]
+)
 def test_sinusoids_beside_a_code_are_named(cell: int, period: float, steps: int) -> None:
     shown = [*ENDS, *bits(Axis.COLUMN, cell=cell), *(Sine(Axis.COLUMN, period, k, steps) for k in range(steps))]
     assert understood(photographed(shown)).patterns == shown
@@ -143,7 +152,7 @@ def test_sinusoids_beside_a_code_are_named(cell: int, period: float, steps: int)
 def test_phase_shifts_without_a_code_are_refused_by_name() -> None:
     periods = [*ENDS, *(Sine(Axis.COLUMN, period, k, 4) for period in (200.0, 50.0, 12.5) for k in range(4))]
     with pytest.raises(BundleError, match="8 images change smoothly, as phase shifts of several periods do"):
-        understood(photographed(periods))
+        understood(photographed(periods, camera=(210, 280)))
 
 
 def test_too_few_bits_for_the_projector_are_said() -> None:

@@ -151,8 +151,8 @@ def test_board_that_stands_still_does_not_move() -> None:
     [
         ((0.03, 0.0, 0.0), False),
         ((0.0, 0.06, 0.0), True),
-        ((0.0, 0.0, 0.15), False),
-        ((3.0, 0.0, 0.0), True),
+        pytest.param((0.0, 0.0, 0.15), False, marks=pytest.mark.slow),
+        pytest.param((3.0, 0.0, 0.0), True, marks=pytest.mark.slow),
     ],
 )
 def test_movement_is_measured_and_above_a_limit_warned_of(shift_mm: tuple[float, float, float], warned: bool) -> None:
@@ -166,6 +166,7 @@ def test_movement_is_measured_and_above_a_limit_warned_of(shift_mm: tuple[float,
     assert (moved > LIMITS.moved_px[0]) == warned
 
 
+@pytest.mark.slow
 def test_board_moved_by_two_squares_does_not_look_as_if_it_stood_still() -> None:
     standing = Standing(rotation_deg=(0.0, 0.0, 0.0))
     there = standing.shifted((2 * BOARD.square_mm, 0.0, 0.0))

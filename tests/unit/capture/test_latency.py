@@ -38,7 +38,7 @@ def rig(folder: Path, camera: Mapping[str, Any] | None = None, **head: Any) -> R
     return Rig("bench", made.cameras, made.projector, {"eye": CameraSettings(0.01)}, None, made, None, made.clock)
 
 
-@pytest.mark.parametrize("trigger", [Trigger.FREE, Trigger.SOFTWARE])
+@pytest.mark.parametrize("trigger", [pytest.param(Trigger.FREE, marks=pytest.mark.slow), Trigger.SOFTWARE])
 def test_lost_frames_are_tolerated(tmp_path: Path, trigger: Trigger) -> None:
     lossy = rig(tmp_path, faults={"light_delay_s": 0.012, "drop_probability": 0.1})
     found = measure_latency(lossy, trigger=trigger).cameras["eye"]

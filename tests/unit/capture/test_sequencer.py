@@ -495,8 +495,8 @@ def test_a_correct_play_counts_at_once() -> None:
     ("projector", "faults"),
     [
         ({"missing_pulses": frozenset({0}), "spoilt_plays": 1}, {}),
-        ({"missing_pulses": frozenset({7}), "spoilt_plays": 2}, {}),
-        ({"extra_pulses": frozenset({0}), "spoilt_plays": 1}, {}),
+        pytest.param({"missing_pulses": frozenset({7}), "spoilt_plays": 2}, {}, marks=pytest.mark.slow),
+        pytest.param({"extra_pulses": frozenset({0}), "spoilt_plays": 1}, {}, marks=pytest.mark.slow),
         ({"extra_pulses": frozenset({9}), "spoilt_plays": 2}, {}),
         ({}, {"drop": frozenset({6})}),
         ({}, {"stale": frozenset({9}), "garbled": frozenset({COUNT + 3})}),
@@ -523,7 +523,11 @@ def test_a_play_that_failed_is_repeated_whole(projector: dict[str, object], faul
             {"extra_pulses": frozenset({0})},
             r"camera 'left' are shifted by one: its frame 1 shows pattern 0. It was triggered once before",
         ),
-        ({"extra_pulses": frozenset({COUNT - 1})}, r"gave more than the 22 frames of the sequence"),
+        pytest.param(
+            {"extra_pulses": frozenset({COUNT - 1})},
+            r"gave more than the 22 frames of the sequence",
+            marks=pytest.mark.slow,
+        ),
         (
             {"missing_pulses": frozenset({COUNT - 1})},
             r"camera 'left' gave 21 of 22 frames, that of pattern 21 \(black.*a trigger pulse was missed",

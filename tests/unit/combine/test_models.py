@@ -509,7 +509,7 @@ def combining(bench: ShootingBench, model_id: UUID) -> None:
     ("leave", "shot"),
     [
         (left(), [0.0, 90.0, 180.0, 270.0]),
-        (between_views, [90.0, 180.0, 270.0]),
+        pytest.param(between_views, [90.0, 180.0, 270.0], marks=pytest.mark.slow),
         (left(DONE, CAPTURING, QUEUED, QUEUED), [180.0, 270.0, 90.0]),
         # The table lost its place.
         (left(DONE, DONE, QUEUED, QUEUED, count="before"), [180.0, 270.0, 0.0, 90.0]),

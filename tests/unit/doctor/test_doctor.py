@@ -140,7 +140,7 @@ def holding(rig: Rig, held: PatternSequence, *, greys: bool = False) -> Rig:
     return replace(rig, projector=cast("Projector", HoldingProjector(rig.projector, held, greys=greys)))
 
 
-@pytest.mark.parametrize("trigger", [Trigger.FREE, Trigger.SOFTWARE])
+@pytest.mark.parametrize("trigger", [pytest.param(Trigger.FREE, marks=pytest.mark.slow), Trigger.SOFTWARE])
 def test_sound_rig_is_sound_by_any_trigger_though_frames_are_lost(rig: Rig, trigger: Trigger) -> None:
     steps: list[str] = []
     diagnosis = run_doctor(

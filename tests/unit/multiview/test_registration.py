@@ -64,7 +64,7 @@ def test_a_vase_is_free_to_turn_about_its_axis_and_keeps_the_starting_angle() ->
         assert across < np.deg2rad(0.02)
 
 
-@pytest.mark.parametrize("noisy", [True, False])
+@pytest.mark.parametrize("noisy", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_two_planes_have_three_free_motions(*, noisy: bool) -> None:
     turned = plane([0.0, 3.0])
     views = turned.noisy(0, length_mm=2.0) if noisy else turned.exact

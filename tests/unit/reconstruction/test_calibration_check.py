@@ -78,7 +78,10 @@ def test_right_calibration_agrees(pairs: PixelPairs) -> None:
     assert not found.is_significant
 
 
-@pytest.mark.parametrize("degrees", [(0, 0.05, 0), (0, 0.15, 0), (0.1, 0, 0), (0, 0, 0.2)])
+@pytest.mark.parametrize(
+    "degrees",
+    [(0, 0.05, 0), (0, 0, 0.2), *(pytest.param(each, marks=pytest.mark.slow) for each in ((0, 0.15, 0), (0.1, 0, 0)))],
+)
 def test_small_turn_of_projector_is_measured(pairs: PixelPairs, degrees: Turn) -> None:
     found = checked((CAMERA, turned(PROJECTOR, degrees), pairs))
 
@@ -162,7 +165,12 @@ MISTAKES: dict[str, tuple[Callable[[PixelPairs], Case], str]] = {
 }
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
+IN_THE_CORE = ("inverse pose", "code with an offset", "bits exchanged")
+
+
+@pytest.mark.parametrize(
+    "mistake", [pytest.param(each, marks=[pytest.mark.slow] * (each not in IN_THE_CORE)) for each in MISTAKES]
+)
 def test_mistake_refutes_the_calibration_and_is_named(pairs: PixelPairs, mistake: str) -> None:
     make, cause = MISTAKES[mistake]
 
@@ -172,6 +180,7 @@ def test_mistake_refutes_the_calibration_and_is_named(pairs: PixelPairs, mistake
     assert cause in found.cause
 
 
+@pytest.mark.slow
 def test_unrelated_pixels_are_refuted_without_a_cause(pairs: PixelPairs) -> None:
     order = np.random.default_rng(1).permutation(len(pairs))
 
@@ -235,7 +244,7 @@ def test_one_frame_of_rows_agrees_with_the_right_calibration(
 @pytest.mark.parametrize(
     ("wrong", "cause"),
     [
-        (inverse_pose(PROJECTOR), "the inverse pose"),
+        pytest.param(inverse_pose(PROJECTOR), "the inverse pose", marks=pytest.mark.slow),
         (turned(PROJECTOR, (2, 1, -2)), "another pose relative to the camera"),
     ],
     ids=["inverse pose", "turned"],

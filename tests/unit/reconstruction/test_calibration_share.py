@@ -24,7 +24,7 @@ from tests.unit.calibration.perturbed import (
     right_camera,
 )
 
-# Kernels of two cameras take seconds to compile.
+# These kernels take ten seconds to compile.
 slow = pytest.mark.slow
 BOX = np.array([[-60.0, -50, 550], [60, 50, 660]])
 NAMES = ("left", "right")
@@ -159,7 +159,8 @@ def changes(calibration: Calibration) -> FloatArray:
     return factor(calibration.solved.covariance).T
 
 
-@pytest.mark.parametrize("axis", [Axis.COLUMN, pytest.param(Axis.ROW, marks=slow)])
+@slow
+@pytest.mark.parametrize("axis", Axis)
 def test_the_share_of_a_camera_and_a_projector(axis: Axis) -> None:
     camera, projector = left_camera(), light_source()
     if axis is Axis.ROW:

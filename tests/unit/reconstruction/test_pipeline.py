@@ -467,7 +467,7 @@ def sigma_ratio(curves: CameraCurves, misses: FloatArray) -> float:
     return float(np.percentile(np.abs(misses) / curves.ensemble.sigma_px, 68.27))
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("width_px", "most_px"),
     [pytest.param(1, 0.3, id="narrow"), pytest.param(4, 0.3, id="half"), pytest.param(4, 0.02, id="half, little")],
@@ -494,7 +494,7 @@ def test_lines_of_single_frames_beside_the_others_are_in_sigma(width_px: int, mo
     assert 0.7 <= sigma_ratio(curves, misses) <= 1.4
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_edges_whose_white_is_clipped_are_within_sigma_and_counted(seed: int) -> None:
     surface = tilted(0.9, 0.2)
     shown = patterns(line_shift=False, cell_px=2, projector=WIDE)

@@ -51,7 +51,7 @@ TWO_PERIODS = played((64.0, 3), (1024.0, 3))
 MICRO = played((18.62, 3), singles=(19.21, 20.08, 20.9, 21.6))
 
 
-def slope(height: int = 40, width: int = 300) -> FloatArray:
+def slope(height: int = 12, width: int = 300) -> FloatArray:
     x, y = grid((height, width))
     return np.asarray(200 + 1.1 * x + 0.13 * y + 3 * np.sin(x / 30))
 
@@ -114,16 +114,21 @@ def located(frames: AxisFrames, code: CodeMap, noise: NoiseModel = NOISE) -> Sin
     return locate_sinusoids(frames, noise.add_variance(1 / 12), code, PROJECTOR_PX)
 
 
-@pytest.mark.parametrize("gamma", [1.0, 2.2])
+SEQUENCES: dict[str, tuple[tuple[Sine, ...], int | None]] = {
+    "4 + Gray": (FOUR_STEPS, 8), "4 + aligned Gray": (FOUR_STEPS, 16), "3 + Gray": (played((16.0, 3)), 8),
+    "three periods": (THREE_PERIODS, None), "2x3": (TWO_PERIODS, None), "micro": (MICRO, None),
+}  # fmt: skip
+"""Patterns, and the cell of their Gray code."""
+DEAR = {("three periods", 1.0), ("three periods", 2.2), ("2x3", 1.0), ("micro", 2.2)}
+
+
 @pytest.mark.parametrize(
-    ("patterns", "cell_px"),
-    [(FOUR_STEPS, 8), (FOUR_STEPS, 16), (played((16.0, 3)), 8), (THREE_PERIODS, None), (TWO_PERIODS, None),
-     (MICRO, None)],
-    ids=["4 + Gray", "4 + aligned Gray", "3 + Gray", "three periods", "2x3", "micro"],
+    ("name", "gamma"),
+    [pytest.param(name, gamma, marks=[pytest.mark.slow] * ((name, gamma) in DEAR))
+     for name in SEQUENCES for gamma in (1.0, 2.2)],
 )  # fmt: skip
-def test_positions_reach_the_bound_of_their_light(
-    patterns: tuple[Sine, ...], cell_px: int | None, gamma: float
-) -> None:
+def test_positions_reach_the_bound_of_their_light(name: str, gamma: float) -> None:
+    patterns, cell_px = SEQUENCES[name]
     position_px = slope()
     frames, code = frames_of(patterns, position_px, gamma=gamma, cell_px=cell_px, has_reference=cell_px is not None)
     found = located(frames, code)
@@ -163,7 +168,7 @@ def test_clipped_pixels_have_no_position() -> None:
 
 
 def test_pixels_too_dark_for_the_number_of_their_period_are_refused() -> None:
-    position_px, noise = slope(), NoiseModel(30.0, 0.02)
+    position_px, noise = slope(40), NoiseModel(30.0, 0.02)
     frames, code = frames_of(TWO_PERIODS, position_px, noise=noise, brighter=0.3, has_reference=False)
     found = located(frames, code, noise)
     error_px = np.abs(found.measured.position - position_px)
@@ -201,12 +206,12 @@ ENDS = (White(), Black())
 
 @pytest.mark.parametrize(
     "patterns",
-    [(*ENDS, *CODE, *FOUR_STEPS), (*CODE, *FOUR_STEPS), played((16.0, 4), (128 / 7, 4)),
-     (*ENDS, *played((16.0, 3), (128.0, 3)))],
-    ids=["white, black, Gray", "Gray", "two periods", "2x3 with white and black"],
+    [pytest.param((*ENDS, *CODE, *FOUR_STEPS), id="white, black, Gray", marks=pytest.mark.slow),
+     pytest.param((*CODE, *FOUR_STEPS), id="Gray"), pytest.param(played((16.0, 4), (128 / 7, 4)), id="two periods"),
+     pytest.param((*ENDS, *played((16.0, 3), (128.0, 3))), id="2x3 with white and black", marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_curves_of_sinusoids_lie_at_their_projector_positions(patterns: tuple[Pattern, ...]) -> None:
-    x, y = grid((90, 200))
+    x, y = grid((45, 200))
     position_px = 10 + 0.5 * x + 0.03 * y
     capture = seen_by_camera(position_px, patterns, Size(128, 96))
     frames = axis_frames(capture, "eye", Axis.COLUMN)
@@ -216,7 +221,7 @@ def test_curves_of_sinusoids_lie_at_their_projector_positions(patterns: tuple[Pa
     assert len(ensemble.position_px) > 90
     seen_px = 10 + 0.5 * ensemble.points_px[:, 0] + 0.03 * ensemble.points_px[:, 1]
     error_px = seen_px - np.repeat(ensemble.position_px, np.diff(ensemble.offsets))
-    assert len(error_px) > 0.9 * 90 * 90
+    assert len(error_px) > 0.9 * 45 * 90
     assert np.abs(error_px).max() < 0.5
     assert abs(error_px.mean()) < 0.02
     # In camera pixels, each half a projector pixel.
@@ -231,7 +236,7 @@ def tables_of(frames: AxisFrames, extent_px: int) -> CodeTables:
 
 
 def test_a_second_axis_of_sinusoids_has_their_positions() -> None:
-    x, y = grid((60, 80))
+    x, y = grid((30, 80))
     position_px = 20 + 0.6 * x + 0.1 * y
     frames = axis_frames(seen_by_camera(position_px, (*ENDS, *CODE, *FOUR_STEPS), Size(128, 96)), "eye", Axis.COLUMN)
     second = decode_second_axis(frames, NoiseModel(0.8, 0.0), tables_of(frames, 128), ReconstructionLimits().decoding)
@@ -241,7 +246,7 @@ def test_a_second_axis_of_sinusoids_has_their_positions() -> None:
 
 
 def test_a_bracket_of_sinusoids_measures_what_its_longest_exposure_clips() -> None:
-    x, y = grid((60, 120))
+    x, y = grid((30, 120))
     position_px = 10 + 0.8 * x + 0.03 * y
     long, short = (
         seen_by_camera(position_px, played((16.0, 4), (128 / 7, 4)), Size(128, 96), white=white)

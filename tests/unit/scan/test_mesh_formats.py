@@ -562,6 +562,7 @@ def digest() -> str:
     return hashlib.sha256(data).hexdigest()
 
 
+@pytest.mark.slow
 def test_the_same_values_give_the_same_bytes_here_and_in_another_process() -> None:
     code = "from tests.unit.scan.test_mesh_formats import digest; print(digest())"
     environment = {**os.environ, "PYTHONHASHSEED": "12345"}

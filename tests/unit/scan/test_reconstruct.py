@@ -571,6 +571,7 @@ def test_the_axis_that_decodes_far_more_is_used_and_told(slanted: Path, tmp_path
     assert asked.axis is Axis.COLUMN
 
 
+@pytest.mark.slow
 def test_both_axes_are_tried_and_the_first_kept_where_the_other_is_worse(slanted: Path, tmp_path: Path) -> None:
     worse = smeared(
         smeared(slanted, tmp_path / "worse", Axis.COLUMN, 121), tmp_path / "worst", Axis.ROW, 191, from_px=0

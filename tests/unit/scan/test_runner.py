@@ -451,7 +451,14 @@ def assert_own(bench: Bench, record: JobRecord) -> None:
     assert record.summary["bundle"] == str(record.id)
 
 
-@pytest.mark.parametrize(("refused", "begins", "lasting"), [(full, 1, 1), (locked, 2, 3), (read_only, 2, 3)])
+@pytest.mark.parametrize(
+    ("refused", "begins", "lasting"),
+    [
+        pytest.param(full, 1, 1, marks=pytest.mark.slow),
+        pytest.param(locked, 2, 3, marks=pytest.mark.slow),
+        (read_only, 2, 3),
+    ],
+)
 def test_a_refused_record_poisons_no_later_scan(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Any, begins: int, lasting: int
 ) -> None:

@@ -117,6 +117,7 @@ def test_a_pair_along_the_stripes_is_passed_over_however_many_points_it_gives() 
     assert triangulate([first, above], None, Axis.COLUMN).baseline_sine < 0.2
 
 
+@pytest.mark.slow
 def test_of_pairs_across_the_stripes_the_one_with_most_points_is_used() -> None:
     first = seen("first", CAMERA, curves_in(CAMERA, MANY))
     few = seen("few", OTHER_CAMERA, curves_in(OTHER_CAMERA, FEW))
@@ -125,6 +126,7 @@ def test_of_pairs_across_the_stripes_the_one_with_most_points_is_used() -> None:
     assert triangulate([first, many, few], None, Axis.COLUMN).second == 1
 
 
+@pytest.mark.slow
 def test_points_without_a_partner_in_the_other_camera_have_their_cause() -> None:
     first = seen("first", CAMERA, curves_in(CAMERA, MANY))
     found = triangulate([first, seen("other", OTHER_CAMERA, curves_in(OTHER_CAMERA, FEW))], None, Axis.COLUMN)

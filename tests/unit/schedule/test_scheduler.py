@@ -467,7 +467,7 @@ class Cut:
             raise PowerCut
 
 
-@pytest.mark.parametrize("kept", [False, True])
+@pytest.mark.parametrize("kept", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_cut_at_any_change_leaves_one_row_for_each_due_time_and_begins_no_run_twice(
     new_desk: NewDesk, *, kept: bool
 ) -> None:

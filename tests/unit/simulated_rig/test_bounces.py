@@ -24,6 +24,9 @@ WHITE = np.full((1, 1), 255, np.uint8)
 # From so far that the light is parallel and even, over a square of 120 mm.
 SUN = {"size_px": [240, 240], "focal_px": [2e5, 2e5], "position_mm": [0.0, 0.0, -1e5], "leak": 0.0}
 
+# Kernels of scattered light, which few scenes need, take seconds to compile.
+pytestmark = pytest.mark.slow
+
 
 def groove(opening_deg: float, **more: Any) -> str:
     options = {"opening_deg": opening_deg, "wall_mm": 40.0, "length_mm": 60.0, "albedo": ALBEDO, **more}

@@ -20,8 +20,7 @@ RENDERED = [path for path in RIGS if tomllib.loads(path.read_text()).get("head",
 @pytest.mark.parametrize(
     "path",
     [
-        # Normals of a mesh that has none take seconds to compile.
-        pytest.param(each, marks=pytest.mark.slow if each.stem == "mesh_file" else (), id=each.stem)
+        pytest.param(each, marks=[pytest.mark.slow] * (each.stem != "sphere"), id=each.stem)
         for each in RENDERED
         if each.stem != "demo"
     ],

@@ -94,6 +94,7 @@ def widths_px(seen: Float32Array) -> tuple[FloatArray, FloatArray]:
     return np.array(found).T[0], np.array(found).T[1]
 
 
+@pytest.mark.slow
 def test_on_a_slanted_plate_lines_widen_as_the_lens_says() -> None:
     seen = image(turned_deg=50.0, lamp=Focus(500.0, 9.0), lens=SHARP)
     sharp = image(turned_deg=50.0, lamp=SHARP, lens=SHARP)

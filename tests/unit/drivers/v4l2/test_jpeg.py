@@ -59,7 +59,10 @@ def test_a_whole_jpeg_is_decoded_as_opencv_does(kind: str, grey: bool) -> None:
             assert np.array_equal(image, np.asarray(cv2.imdecode(data, flag)))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind",
+    ["halved colour", *(pytest.param(each, marks=pytest.mark.slow) for each in KINDS if each != "halved colour")],
+)
 def test_a_lost_packet_is_found(kind: str) -> None:
     rng, data = np.random.default_rng(7), picture(kind)
     # What a high-speed USB packet carries, and a scan of some sixty thousand bytes.
