@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from slrig.errors import BundleError
 from slrig.importers.detection import Light
-from slrig.importers.orders import ProjectorCode, slstudio_micro_sequence
+from slrig.importers.orders import SLSTUDIO_PERIODS, ProjectorCode, slstudio_micro_sequence
 from slrig.model import MIN_LINE_STEPS, MIN_SINE_PERIOD_PX, Axis, Black, FloatArray, Pattern, Sine, Size, White
 from slrig.patterns import sine_periods_px
 
@@ -31,17 +31,19 @@ _LIT, _MIN_LIT = 0.2, 300  # of the range of light that few samples exceed; leas
 _HALF_LIT, _MIN_HALF_LIT = 0.25, 0.12  # of the range from its middle; share of the samples of a sinusoid
 _SAME = 0.15  # of the variation of an image, that it differs from its copy
 _FLAT = 0.25  # of the usual variation between samples, of white and black
-_EXPONENTS = 1.0, 0.5, 2.0  # of light, near the one that undoes the response of camera and projector
+_EXPONENTS = 1.0, 0.5, 0.3, 2.0  # of light, near the one that undoes the response of camera and projector
 _CLIPPED, _MIN_CLEAR = 0.99, 0.3  # of the brightest sample; least share of samples that are never brighter
-_MAX_REFERENCES = 4
+_MAX_CHOICES = 16  # of images that may be white and black
 _EVEN_TURNS = 2.0  # over the image, of phases that are as frequent
 _FREE_LIGHT = 0.2  # of the square of an image's light over the usual one, as much as one of the residual
 _MORE_PERIODS = 0.01  # cost of a period, over the share of light that its steps do not explain
-_SURE_REST, _MAX_REST = 0.03, 0.12  # of the square of the first harmonic, per degree of freedom
+_SURE_REST, _MAX_REST = 0.03, 0.18  # of the square of the first harmonic, per degree of freedom
+_UNEQUAL = 0.05  # cost of another number of steps
 _MAX_TURN = 0.3  # of a phase, over a distance that tells how fast it grows
 _MIN_STEADY = 0.6  # coherence, of the growth of a phase over a distance
 _BLUR = 5  # samples; of a phase that grows by less than the limit over them
-_MIN_VISIBLE_TURNS, _MAX_VISIBLE_TURNS = 0.06, 1.02  # of a phase that numbers others
+_MIN_VISIBLE_TURNS, _MAX_VISIBLE_TURNS = 0.06, 1.08  # of a phase that numbers others
+_BINS = 256
 _PACE_ERROR = 0.1  # of how much faster a phase grows than another
 _MIN_COHERENT = 0.6  # of a phase with positions
 _MAX_UNIT = 8  # periods over the screen, of the phase that numbers others
@@ -49,10 +51,10 @@ _MAX_STRETCH, _RARE_UNIT, _RARE_NUMBER, _MAX_SETS = 0.15, 1.0, 0.25, 12
 _BENT_TURNS = 0.02  # error of a phase over all that is visible
 _MAX_COST = 4.0
 _SURE_TURNS = 0.006  # error of the phase at the first pixel, with what harmonics do to it
-_RIVAL = 0.3  # of costs of two readings that count as equally good
+_RIVAL = 0.45  # of costs of two readings that count as equally good
 _REFUTED, _OFF_CENTRE, _CENTRE = 3.0, 3.0, 0.12  # costs of a visible range, distance from the middle
 _MAX_BEYOND = 0.03  # of the samples, that may be beyond the projector
-_MIN_SPAN_USED = 0.5  # share of a span that the projector shows
+_MIN_SPAN_USED = 0.25  # share of a span that the projector shows
 _MAX_PERIOD_PX = 64  # of the finest sinusoid of a program's set
 _MICRO_FIT = 0.93  # correlation of images with the light at the best position
 
@@ -60,14 +62,15 @@ _MICRO_FIT = 0.93  # correlation of images with the light at the best position
 @dataclass(frozen=True, slots=True)
 class SinusoidAxis:
     """Sinusoids of one axis. shown : pattern of each image. periods_px : of each period; visible_px : first and last
-    position that is visible. other_periods_px : that fit as well. is_start_unsure : True if the first images may begin
-    with other shifts. is_mixed : True if some are shifted against others.
+    position that is visible; span_px : which all periods divide. other_periods_px : that fit as well. is_start_unsure :
+    True if the first images may begin with other shifts. is_mixed : True if some are shifted against others.
     """
 
     axis: Axis
     shown: Mapping[int, Sine]
     periods_px: tuple[float, ...]
     visible_px: tuple[float, float]
+    span_px: float = math.nan
     other_periods_px: tuple[tuple[float, ...], ...] = ()
     is_start_unsure: bool = False
     is_mixed: bool = False
@@ -104,9 +107,13 @@ class _Period:
 
 def _flat_images(light: FloatArray) -> list[int]:
     """Return which of (n, k) images may be white or black: their share of the mean light is the same everywhere."""
-    low, high = np.percentile(light / light.mean(axis=0), (16, 84), axis=1)
-    spread = high - low
-    return [int(each) for each in np.flatnonzero(spread < _FLAT * float(np.percentile(spread, 75)))]
+    found: set[int] = set()
+    for exponent in _EXPONENTS[:2]:
+        shown = light**exponent
+        low, high = np.percentile(shown / shown.mean(axis=0), (16, 84), axis=1)
+        spread = high - low
+        found |= set(np.flatnonzero(spread < _FLAT * float(np.percentile(spread, 75))).tolist())
+    return sorted(found)
 
 
 def find_sinusoids(samples: Sequence[Light], projector: Size, *, step_px: int) -> SinusoidSet | str:
@@ -114,7 +121,7 @@ def find_sinusoids(samples: Sequence[Light], projector: Size, *, step_px: int) -
 
     samples : (3, h, w) of each image, a sample every step_px pixels.
     """
-    stack = np.stack([each.reshape(3, -1) for each in samples])
+    stack = np.stack([each.reshape(3, -1) for each in samples]).astype(np.float64)
     span = np.ptp(stack, axis=0).min(axis=0)
     top = float(stack.max())
     lit = span > _LIT * np.percentile(span, 99)
@@ -123,7 +130,7 @@ def find_sinusoids(samples: Sequence[Light], projector: Size, *, step_px: int) -
     slots = np.flatnonzero(lit).astype(np.int32)
     if len(slots) < _MIN_LIT:
         return "too little of them is lit"
-    stack = np.maximum(stack[..., slots], 0.5).astype(np.float64) / top
+    stack = np.maximum(stack[..., slots], 0.5) / top
     thin = stack[:, 0, :: max(1, len(slots) // _THIN)]
     low, high = thin.min(axis=0), thin.max(axis=0)
     half = np.abs((thin - low) / (high - low) - 0.5) < _HALF_LIT
@@ -150,11 +157,12 @@ def find_sinusoids(samples: Sequence[Light], projector: Size, *, step_px: int) -
         rate = [_rate(grid, phase[0], _growth(phase[0], phase[plane]), along) for plane, along in ((1, 1), (2, 0))]
         periods.append(_Period(run, phase[0], (rate[0], rate[1])))
     periods = _even_periods(periods, grid)
-    axes = []
+    axes: list[SinusoidAxis] = []
     for axis in Axis:
         own = [each for each in periods if each.axis is axis]
         if own:
-            numbered = _number(own, axis, grid, projector.along(axis))
+            others_px = [each.span_px for each in axes]
+            numbered = _number(own, axis, grid, projector.along(axis), others_px)
             if isinstance(numbered, str):
                 return numbered
             axes.append(numbered)
@@ -181,22 +189,23 @@ def _find_periods(
 
     light : (n, k) of all images.
     """
-    flat = [images[k] for k in _flat_images(light[list(images)])][:_MAX_REFERENCES]
+    flat = [images[k] for k in _flat_images(light[list(images)])]
     # Of one period that is visible in part, an image may be about as dark everywhere as black.
-    choices = [ends for number in range(len(flat), -1, -1) for ends in combinations(flat, number)]
-    best: tuple[float, list[tuple[int, ...]], float] = (_MAX_REST, [], 1.0)
+    choices = [ends for number in range(len(flat), -1, -1) for ends in combinations(flat, number)][:_MAX_CHOICES]
+    best: tuple[float, list[tuple[int, ...]], float] = (math.inf, [], 1.0)
     for ends in choices:
         used = [index for index in images if index not in ends]
-        if (micro := _find_micro(light[used], used, projector)) is not None:
-            return [tuple(used)], 1.0, micro
-        for exponent in _EXPONENTS:
-            rest, runs = _split(light[used] ** exponent)
-            if rest < best[0]:
-                best = rest, [tuple(used[k] for k in run) for run in runs], exponent
+        shown = [light[used] ** exponent for exponent in _EXPONENTS]
+        for each in shown:
+            if (micro := _find_micro(each, used, projector)) is not None:
+                return [tuple(used)], 1.0, micro
+        for exponent, each in zip(_EXPONENTS, shown, strict=True):
+            rest, runs = _split(each)
+            against = rest + _UNEQUAL * (len({len(run) for run in runs}) - 1)
+            if rest < _MAX_REST and against < best[0]:
+                best = against, [tuple(used[k] for k in run) for run in runs], exponent
             if best[0] < _SURE_REST:
-                break
-        if best[0] < _SURE_REST:
-            break
+                return best[1], best[2], None
     return (best[1], best[2], None) if best[1] else None
 
 
@@ -208,7 +217,7 @@ def _light_factors(light: FloatArray, runs: Sequence[tuple[int, ...]]) -> FloatA
         mean = (light[shown] * factors[shown, None]).mean(axis=0)
         for run in runs:
             own = light[list(run)] / mean
-            factors[list(run)] = _solved(own @ own.T / own.shape[1], own.mean(axis=1), _FREE_LIGHT / 40)
+            factors[list(run)] = _solved(own @ own.T / own.shape[1], own.mean(axis=1), _FREE_LIGHT / 8)
     return factors
 
 
@@ -232,7 +241,9 @@ def _even_periods(periods: Sequence[_Period], grid: _Grid) -> list[_Period]:
         for number in (steps, 2 * steps):
             share = np.mean(usual.phase.conj() ** number)
             turns = turns + np.real(share * period.phase**number / (1j * np.pi * number))
-        even.append(_Period(period.images, np.exp(2j * np.pi * turns), period.rate))
+        phase = np.exp(2j * np.pi * turns)
+        right, down = (_rate(grid, phase, rate, along) for rate, along in zip(period.rate, (1, 0), strict=True))
+        even.append(_Period(period.images, phase, (right, down)))
     return even
 
 
@@ -244,7 +255,7 @@ def _split(light: FloatArray) -> tuple[float, list[tuple[int, ...]]]:
     count, light = len(light), light / light.mean(axis=0)
     gram, mean = light @ light.T / light.shape[1], light.mean(axis=1)
     ways: list[list[tuple[int, ...]]] = []
-    best: list[tuple[float, list[tuple[int, ...]]]] = [(0.0, [])] + [(math.inf, [])] * count
+    best: list[tuple[float, list[tuple[int, ...]]]] = [(math.inf if end else 0.0, []) for end in range(count + 1)]
     for end in range(1, count + 1):
         for steps in range(MIN_LINE_STEPS, min(_MAX_STEPS, end) + 1):
             before, runs = best[end - steps]
@@ -352,7 +363,9 @@ class _Signal:
     rate: float
 
 
-def _number(periods: Sequence[_Period], axis: Axis, grid: _Grid, extent: int) -> SinusoidAxis | str:
+def _number(
+    periods: Sequence[_Period], axis: Axis, grid: _Grid, extent: int, others_px: Sequence[float]
+) -> SinusoidAxis | str:
     """Return the sinusoids of an axis with their periods, or why these are not determined."""
     if len(periods) == 1:
         return (
@@ -382,7 +395,7 @@ def _number(periods: Sequence[_Period], axis: Axis, grid: _Grid, extent: int) ->
             f"{len(periods)} periods of {axis}s, as {rates} in number, turn more than once over what is visible, as do "
             "their differences: nothing numbers them"
         )
-    return _placed(periods, phases, axis, best[1], best[2], extent)
+    return _placed(periods, phases, axis, best[1], best[2], extent, others_px)
 
 
 def _calm(phase: Phasors, rate: float, grid: _Grid) -> _Signal:
@@ -410,9 +423,10 @@ def _unwrapped(
     often it turns over one of these.
     """
     turns = np.angle(anchor.phase) / (2 * np.pi) % 1
-    counts = np.bincount((turns * 64).astype(int) % 64, minlength=64)
-    empty = np.convolve(np.tile(counts, 3), np.ones(7), mode="same")[64:128]
-    position = (turns - (int(np.argmin(empty)) + 0.5) / 64) % 1
+    # The screen ends where the fewest samples are; of a wide gap, in its middle.
+    counts = np.tile(np.bincount((turns * _BINS).astype(int) % _BINS, minlength=_BINS), 3)
+    narrow, wide = (np.convolve(counts, np.ones(size) / size, mode="same")[_BINS:-_BINS] for size in (5, 65))
+    position = (turns - (int(np.argmin(narrow + 0.1 * wide)) + 0.5) / _BINS) % 1
     for signal in sorted((each for each in (*helping, *fine) if each is not anchor), key=lambda each: each.rate):
         if signal.rate < 1.2 * anchor.rate:
             continue
@@ -478,6 +492,7 @@ def _placed(
     position: FloatArray,
     ratio: FloatArray,
     extent: int,
+    others_px: Sequence[float],
 ) -> SinusoidAxis | str:
     """Return sinusoids of whole numbers of periods over a span, by the extent of the projector.
 
@@ -498,34 +513,34 @@ def _placed(
         sigma = _SURE_TURNS + _BENT_TURNS / 2 / (counts * (high - low) * scale)
         weight = counts / sigma**2
         shifts = np.arange(0, 1, 1 / (24 * counts.max()))
-        # Positions count from the first pixel. At steps in depth a few are wrong.
-        middle = (low + high) / 2 * scale + shifts
-        whole = np.floor(middle)
         ordered = np.sort(place)
-        for (span_px, against), (start, rare) in product(_spans(counts, extent), _starts(signs, steps)):
+        spans = _spans(counts, extent, others_px)
+        for (span_px, against), (start, rare) in product(spans, _starts(signs, steps)):
             turns = offset[:, None] - counts[:, None] * shifts + start[:, None]
             turns -= np.rint(turns)
             # A shift between those that are tried fits best, by least squares.
             finer = (weight @ turns) / float(weight @ counts)
             cost = 0.5 * (((turns - counts[:, None] * finer) / sigma[:, None]) ** 2).mean(axis=0)
-            cost += _OFF_CENTRE * np.maximum(0.0, np.abs((middle - whole) * span_px / extent - 0.5) - _CENTRE)
-            ends = (np.searchsorted(ordered, whole - shifts + end) for end in (0.0, extent / span_px))
+            # Positions count from the first pixel. At steps in depth a few are wrong.
+            middle = (low + high) / 2 * scale + shifts + finer
+            begin = shifts + finer - np.floor(middle)
+            cost += _OFF_CENTRE * np.maximum(0.0, np.abs(middle % 1 * span_px / extent - 0.5) - _CENTRE)
+            ends = (np.searchsorted(ordered, end - begin) for end in (0.0, extent / span_px))
             cost += _REFUTED * (np.subtract(*ends) > (_MAX_BEYOND - 1) * len(ordered))
             at = int(np.argmin(cost))
-            begin = shifts[at] - whole[at]
-            visible = float((low * scale + begin) * span_px), float((high * scale + begin) * span_px)
+            visible = float((low * scale + begin[at]) * span_px), float((high * scale + begin[at]) * span_px)
             found.append((float(cost[at]) + against + rare + misfit, span_px, key, tuple(start.tolist()), visible))
     if not found:
         return f"the numbers of periods of {axis}s are no whole numbers over any length"
     found.sort()
-    value, span_px, counts, start, visible = found[0]
-    if span_px / max(counts) < MIN_SINE_PERIOD_PX:
-        return f"{max(counts)} periods over {span_px:g} {axis}s are too many for its pixels"
+    value, span_px, best, begins, visible = found[0]
+    if span_px / max(best) < MIN_SINE_PERIOD_PX:
+        return f"{max(best)} periods over {span_px:g} {axis}s are too many for its pixels"
     if value > _MAX_COST:
         return f"the places of the periods of {axis}s contradict each other, or the projector's extent of {extent}"
-    lengths = tuple(span_px / count for count in counts)
+    lengths = tuple(span_px / count for count in best)
     shown: dict[int, Sine] = {}
-    for period, length_px, sign, begin in zip(periods, lengths, signs.tolist(), start, strict=True):
+    for period, length_px, sign, begin in zip(periods, lengths, signs.tolist(), begins, strict=True):
         count = len(period.images)
         # A quarter of a period is a step of twice or four times as many.
         finer = next(k for k in (1, 2, 4) if abs(begin * k * count - round(begin * k * count)) < 1e-6)
@@ -535,9 +550,9 @@ def _placed(
     close = [each for each in found[1:] if each[0] < value + _RIVAL]
     others = dict.fromkeys(tuple(each[1] / count for count in each[2]) for each in close)
     return SinusoidAxis(
-        axis, shown, lengths, visible,
+        axis, shown, lengths, visible, span_px,
         other_periods_px=tuple(each for each in others if not np.allclose(each, lengths)),
-        is_start_unsure=any(each[1:3] == (span_px, counts) and each[3] != start for each in close),
+        is_start_unsure=any(each[1:3] == (span_px, best) and each[3] != begins for each in close),
         is_mixed=len(set(signs.tolist())) > 1,
     )  # fmt: skip
 
@@ -550,18 +565,25 @@ def _starts(signs: NDArray[np.int_], steps: NDArray[np.int_]) -> Iterator[tuple[
     yield signs / steps % 1, 0.5
 
 
-def _spans(counts: NDArray[np.int_], extent: int) -> Iterator[tuple[float, float]]:
-    """Yield lengths of which periods are whole fractions, for a projector, and what speaks against each."""
+def _spans(counts: NDArray[np.int_], extent: int, others_px: Sequence[float]) -> Iterator[tuple[float, float]]:
+    """Yield lengths of which periods are whole fractions, for a projector, and what speaks against each.
+
+    others_px : lengths of the other axis.
+    """
     least = math.lcm(*counts.tolist())
     is_whole = extent % least == 0
-    yield float(extent), 0.0 if is_whole else 0.2
+    is_slstudio = sorted(counts.tolist()) == [1, SLSTUDIO_PERIODS]
+    yield float(extent), -0.4 if is_slstudio else 0.0 if is_whole else 0.2
     # Periods of whole pixels over a little more than the projector, over a power of two, or over twice as much.
-    others = {2 * extent: 0.4, -(-extent // least) * least: 0.1 if least > extent / 2 else 0.3}
+    longer = {2.0 * extent: 0.4, float(-(-extent // least) * least): 0.1 if least > extent / 2 else 0.3}
     power = 1 << (extent - 1).bit_length()
-    others |= {power: 0.3} if power % least == 0 else {}
-    for span, against in others.items():
+    longer |= {float(power): 0.3} if power % least == 0 else {}
+    for span, against in longer.items():
         if span != extent and extent / span >= _MIN_SPAN_USED:
-            yield float(span), against + 0.3 * is_whole
+            excess = max(0.0, math.log2(span / extent) - 1)
+            yield span, against + 0.1 * is_whole + 0.3 * excess
+    # The same periods as along the other axis.
+    yield from ((span, 0.1) for span in others_px if span > extent and span not in longer)
     most = int(counts.max())
     for period_px in range(math.ceil(MIN_SINE_PERIOD_PX), _MAX_PERIOD_PX + 1):
         near = most * period_px / np.array(sine_periods_px(extent, period_px))
@@ -571,15 +593,16 @@ def _spans(counts: NDArray[np.int_], extent: int) -> Iterator[tuple[float, float
             yield float(most * period_px), -0.6 if not is_common else 0.1 if extent < 0.2 * most**2 else 0.35
 
 
-def _find_micro(light: Light, images: Sequence[int], projector: Size) -> SinusoidAxis | None:
+def _find_micro(light: FloatArray, images: Sequence[int], projector: Size) -> SinusoidAxis | None:
     """Return SLStudio's micro phase shift, whose periods have too few steps for a phase of each, if images show it.
 
     light : (n, k) of images. Each pixel's light must be that of a position.
     """
     try:
-        patterns = slstudio_micro_sequence(ProjectorCode(projector), len(images))
+        every = slstudio_micro_sequence(ProjectorCode(projector), len(images))
     except BundleError:
         return None
+    patterns = [each for each in every if isinstance(each, Sine)]
     shown = light - light.mean(axis=0)
     shown = shown / np.maximum(np.linalg.norm(shown, axis=0), 1e-6)
     places = np.arange(0, projector.width_px, 0.5)

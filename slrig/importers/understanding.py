@@ -162,41 +162,40 @@ def _describe_sinusoids(sinusoids: SinusoidSet, count: int, projector: Size, nam
     """Say which sinusoids images show, and what else they may be."""
     found = Understanding([sinusoids.references.get(index) for index in range(count)])
     for kind in (White(), Black()):
-        images = [name(index) for index, each in sinusoids.references.items() if each == kind]
-        found.facts.append(f"{kind.kind}: {', '.join(images)}" if images else f"no {kind.kind} image")
+        named = [name(index) for index, shown in sinusoids.references.items() if shown == kind]
+        found.facts.append(f"{kind.kind}: {', '.join(named)}" if named else f"no {kind.kind} image")
     for copy, original in sinusoids.copies.items():
         found.doubts.append(Doubt(f"{name(copy)} is a copy of {name(original)}: left out", (copy,), is_fault=True))
         found.left_out[copy] = "a copy"
     for each in sinusoids.axes:
-        axis, images = each.axis, sorted(each.shown)
+        axis, images = each.axis, tuple(sorted(each.shown))
         for image, sine in each.shown.items():
             found.patterns[image] = sine
-        periods = dict.fromkeys(sine.period_px for sine in each.shown.values())
-        steps = ", ".join(str(sum(sine.period_px == period for sine in each.shown.values())) for period in periods)
+        steps = [sum(sine.period_px == period for sine in each.shown.values()) for period in each.periods_px]
         first, last = (min(max(round(end), 0), projector.along(axis) - 1) for end in each.visible_px)
         found.facts.append(
-            f"sinusoids of {axis}s without a code, periods of {_numbers(periods)} px in {steps} steps: "
-            f"{name(images[0])} to {name(images[-1])}; {axis}s {first} to {last} of {projector.along(axis)} are "
+            f"sinusoids of {axis}s without a code, periods of {_numbers(each.periods_px)} px in {_numbers(steps)} "
+            f"steps: {name(images[0])} to {name(images[-1])}; {axis}s {first} to {last} of {projector.along(axis)} are "
             "visible to a camera that stands upright"
         )
         if each.other_periods_px:
             others = " or ".join(map(_numbers, each.other_periods_px[:2]))
             text = (
-                f"the periods of {axis}s are as {_numbers(periods)} px, so that they fit the projector; the images fit "
-                f"{others} px as well: if they are others, state them by --pattern, as "
-                f"'columns-sine:{next(iter(periods)):g}/4', or by --list"
+                f"the periods of {axis}s are taken as {_numbers(each.periods_px)} px, by the projector's extent; the "
+                f"images fit {others} px as well: if they are others, state them by --pattern, as "
+                f"'{axis}s-sine:{each.periods_px[0]:g}/{steps[0]}', or by --list"
             )
-            found.doubts.append(Doubt(text, tuple(images)))
+            found.doubts.append(Doubt(text, images))
         if each.is_start_unsure:
-            one = next(iter(each.shown.values()))
+            sine = each.shown[images[0]]
             text = (
-                f"the sinusoids of {axis}s may begin at another place than {one.shift}/{one.steps} of their periods, "
+                f"the sinusoids of {axis}s may begin at another place than {sine.shift}/{sine.steps} of their periods, "
                 "which moves all positions: if so, state them by --list"
             )
-            found.doubts.append(Doubt(text, tuple(images)))
+            found.doubts.append(Doubt(text, images))
         if each.is_mixed:
             text = f"some sinusoids of {axis}s are shifted forward and others backward: no program is known to do so"
-            found.doubts.append(Doubt(text, tuple(images)))
+            found.doubts.append(Doubt(text, images))
     return found
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -146,7 +146,7 @@ def shifted(axis: Axis, *periods: float, steps: int, backward: bool = False) -> 
     return [[Sine(axis, period, -k % steps if backward else k, steps) for k in range(steps)] for period in periods]
 
 
-def joined(groups: Sequence[Sequence[Pattern]]) -> list[Pattern]:
+def joined(groups: Iterable[Sequence[Pattern]]) -> list[Pattern]:
     return [each for group in groups for each in group]
 
 
