@@ -52,7 +52,8 @@ _BENT_TURNS = 0.02  # error of a phase over all that is visible
 _MAX_COST = 4.0
 _SURE_TURNS = 0.006  # error of the phase at the first pixel, with what harmonics do to it
 _RIVAL = 0.45  # of costs of two readings that count as equally good
-_REFUTED, _OFF_CENTRE, _CENTRE = 3.0, 3.0, 0.12  # costs of a visible range, distance from the middle
+_REFUTED, _MAX_OFF_CENTRE = 3.0, 0.45  # costs of a visible range
+_OFF_CENTRE = 0.15  # of the projector's extent, that the middle of what is visible is usually from its own
 _MAX_BEYOND = 0.03  # of the samples, that may be beyond the projector
 _MIN_SPAN_USED = 0.25  # share of a span that the projector shows
 _MAX_PERIOD_PX = 64  # of the finest sinusoid of a program's set
@@ -400,7 +401,7 @@ def _number(
 
 def _calm(phase: Phasors, rate: float, grid: _Grid) -> _Signal:
     """Return a phase with less noise, where it grows slowly."""
-    if abs(rate) * grid.step_px * _BLUR < _MAX_TURN / 2:
+    if abs(rate) * grid.step_px * _BLUR < _MAX_TURN:
         whole = grid.spread(phase)
         parts = [cv2.blur(np.ascontiguousarray(part), (_BLUR, _BLUR)) for part in (whole.real, whole.imag)]
         phase = (parts[0] + 1j * parts[1]).ravel()[grid.slots]
@@ -524,7 +525,8 @@ def _placed(
             # Positions count from the first pixel. At steps in depth a few are wrong.
             middle = (low + high) / 2 * scale + shifts + finer
             begin = shifts + finer - np.floor(middle)
-            cost += _OFF_CENTRE * np.maximum(0.0, np.abs(middle % 1 * span_px / extent - 0.5) - _CENTRE)
+            off = middle % 1 * span_px / extent - 0.5
+            cost += np.minimum(0.5 * (off / _OFF_CENTRE) ** 2, _MAX_OFF_CENTRE)
             ends = (np.searchsorted(ordered, end - begin) for end in (0.0, extent / span_px))
             cost += _REFUTED * (np.subtract(*ends) > (_MAX_BEYOND - 1) * len(ordered))
             at = int(np.argmin(cost))
