@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import random
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -211,12 +211,7 @@ def make_folder(seed: int, path: Path, *, scene_number: int | None = None) -> Fo
         folder.kinds.append(f"twice {shown[place]}")
         shown.insert(place, shown[place])
         images.insert(place, images[place].copy())
-    path.mkdir(parents=True)
-    for name, pattern, image in zip(_names(chance, len(images), folder.kinds), shown, images, strict=True):
-        folder.shown[name] = pattern
-        file = path / name
-        file.parent.mkdir(exist_ok=True)
-        assert cv2.imwrite(str(file), image)
+    _write(chance, folder, shown, images)
     if fault == "lone":
         room = cv2.GaussianBlur(
             np.random.default_rng(seed).uniform(0, 255, images[0].shape).astype(np.float32), (0, 0), 9
@@ -227,6 +222,86 @@ def make_folder(seed: int, path: Path, *, scene_number: int | None = None) -> Fo
         cv2.imwrite(str(file), lone if chance.random() < 0.5 else lone[:-7])
         folder.shown[str(file.relative_to(path))] = None
     return folder
+
+
+def sinusoid_sequence(chance: random.Random, size: Size, kinds: list[str]) -> list[Pattern]:
+    """A random program's sinusoids of several periods, which number positions without a Gray code."""
+    style = chance.choice(
+        ["spanning", "spanning", "spanning", "beats", "beats", "near", "near", "2x3", "micro", "whole"]
+    )
+    axes = chance.choice([[Axis.COLUMN], [Axis.COLUMN], [Axis.COLUMN, Axis.ROW], [Axis.ROW, Axis.COLUMN]])
+    steps = chance.choice([3, 3, 4, 4, 4, 5, 6, 8])
+    direction, start = chance.choice([1, 1, -1]), chance.choice([0, 0, 0, 1])
+    order = chance.choice(["periods", "periods", "periods", "steps"])
+    ends = chance.choice(["WB first", "BW first", "WB last", "none", "none", "both"])
+    if style in ("2x3", "micro"):
+        axes, steps, direction, start, order, ends = [Axis.COLUMN], 3, 1, 0, "periods", "none"
+    kinds += [style, "+".join(axes), f"{steps} steps", "forward" if direction > 0 else "backward",
+              "sine" if start else "cosine", f"by {order}", ends]  # fmt: skip
+    wide = min(map(size.along, axes)) > 560
+    choices: dict[str, list[tuple[int, ...]]] = {
+        "spanning": [(1, 8, 64), (1, 6, 36), (1, 4, 16, 64), (1, 16), (1, 12, 48), (1, 5, 25)],
+        "beats": [(28, 26, 23), (31, 28, 26), (36, 35, 30), *([(70, 64, 59)] if wide else [])],
+        "2x3": [(1, 16)],
+    }
+    counts = chance.choice(choices.get(style, [()]))
+    if chance.random() < 0.5 or style == "2x3":
+        counts = counts[::-1]
+    near_px, whole_px = chance.choice([8.0, 10.0, 12.0, 16.0]), chance.choice([(16, 128, 1024), (14, 13, 12)])
+    kinds.append(str({"near": near_px, "whole": whole_px}.get(style, counts)))
+    body: list[Pattern] = []
+    for axis in axes:
+        extent = size.along(axis)
+        number = max(3, -(-extent // int(near_px)) + 1)
+        periods: dict[str, list[float]] = {
+            "near": [near_px, number * near_px / (number - 1), number * near_px / (number - round(number**0.5))],
+            "whole": [float(each) for each in whole_px],
+        }
+        if style == "micro":
+            others = (70.0, 71.32, 72.47, 73.72, 76.23, 77.35, 78.4, 79.22, 80.0)
+            body += [Sine(axis, 75.02, k, 3) for k in (0, 2, 1)]
+            body += [Sine(axis, period, 1 - k % 2, 2) for k, period in enumerate(others)]
+            continue
+        own = periods.get(style, [extent / each for each in counts if extent / each >= 6])
+        # A sine begins a quarter of a period before a cosine.
+        finer = 1 if not start or steps % 4 == 0 else 2 if steps % 2 == 0 else 4
+        first = finer * steps // 4 * start
+        shifted = [[Sine(axis, period, (first + direction * finer * k) % (finer * steps), finer * steps)
+                    for k in range(steps)] for period in own]  # fmt: skip
+        body += [each for group in (shifted if order == "periods" else zip(*shifted, strict=True)) for each in group]
+    white, black = White(), Black()
+    leading: dict[str, list[Pattern]] = {"WB first": [white, black], "BW first": [black, white], "both": [white, black]}
+    closing: dict[str, list[Pattern]] = {"WB last": [white, black], "both": [white, black]}
+    return [*leading.get(ends, []), *body, *closing.get(ends, [])]
+
+
+def make_sinusoid_folder(seed: int, path: Path) -> Folder:
+    """Write a folder of images of sinusoids of several periods by chance."""
+    chance = random.Random(f"sinusoids {seed}")
+    number = chance.randrange(len(SCENES))
+    stage = scene(number)
+    folder = Folder(path, stage.size)
+    shown: list[Pattern | None] = list(sinusoid_sequence(chance, stage.size, folder.kinds))
+    fault = chance.choice(["right"] * 8 + ["twice"])
+    folder.kinds += [f"scene {number}", fault]
+    profiles = [pattern_light(each, stage.size) for each in shown if each is not None]
+    images = _photographed(chance, stage, profiles, folder.kinds)
+    if fault == "twice":
+        place = chance.randrange(1, len(shown))
+        folder.kinds.append(f"twice {shown[place]}")
+        shown.insert(place, shown[place])
+        images.insert(place, images[place].copy())
+    _write(chance, folder, shown, images)
+    return folder
+
+
+def _write(chance: random.Random, folder: Folder, shown: Sequence[Pattern | None], images: Sequence[Pixels]) -> None:
+    folder.path.mkdir(parents=True)
+    for name, pattern, image in zip(_names(chance, len(images), folder.kinds), shown, images, strict=True):
+        folder.shown[name] = pattern
+        file = folder.path / name
+        file.parent.mkdir(exist_ok=True)
+        assert cv2.imwrite(str(file), image)
 
 
 def _photographed(
@@ -319,9 +394,11 @@ def judge(folder: Folder, understood: ImageAssignment | SlrigError) -> str:
     return "wrong" if understood.understood is not None and understood.understood.doubts else "wrong in silence"
 
 
-def understand_folder_of(seed: int, path: Path) -> tuple[Folder, str]:
+def understand_folder_of(
+    seed: int, path: Path, make: Callable[[int, Path], Folder] = make_folder
+) -> tuple[Folder, str]:
     """Write a folder by chance and judge what the importer makes of it without an option."""
-    folder = make_folder(seed, path)
+    folder = make(seed, path)
     try:
         understood: ImageAssignment | SlrigError = assign_images(path, ProjectorCode(folder.projector), ImageNaming())
     except SlrigError as cause:

@@ -59,9 +59,14 @@ _REFUTED, _BACKWARD, _LEFT_HANDED, _CENTRED = 3.0, 0.5, 2.0, 0.35  # costs of a 
 _OFF_CENTRE = 3.0  # cost of a visible range whose middle is a projector's extent away from its middle
 
 
+def sample_step_px(shape: tuple[int, ...]) -> int:
+    """Distance from one sample of an image of (H, W) pixels to the next."""
+    return max(1, math.ceil(math.sqrt(shape[0] * shape[1] / _SAMPLES)))
+
+
 def sample_image(image: Pixels) -> Light:
     """Return samples of an image on a grid, with their right and lower neighbours: (3, h, w) float32."""
-    step = max(1, math.ceil(math.sqrt(image.shape[0] * image.shape[1] / _SAMPLES)))
+    step = sample_step_px(image.shape)
     rows, columns = (max(1, (length - 2) // step + 1) for length in image.shape[:2])
     planes = [image[y::step, x::step][:rows, :columns] for y, x in ((0, 0), (0, 1), (1, 0))]
     return np.stack(planes).astype(np.float32)
@@ -120,8 +125,8 @@ def find_light(samples: Sequence[Light], *, trimmed: int = 1) -> Lit | None:
         found = _factors(light, sigma / span[0, lit])
         is_measured = np.isfinite(found)
         # Lines are dimmer than bits.
-        bright = found[is_measured & (found > _MIN_FACTOR * np.nanmax(found))] if is_measured.any() else np.ones(1)
-        usual = float(np.median(bright))
+        measured = found[is_measured] if is_measured.any() else np.ones(1)
+        usual = float(np.median(measured[measured > _MIN_FACTOR * np.percentile(measured, 85)]))
         factor = factor * np.where(is_measured, found, usual) / usual
     slots = np.flatnonzero(lit).astype(np.int32)
     raw = (stack[:, 0, lit] - low[0, lit]) / span[0, lit]

@@ -13,7 +13,7 @@ import numpy as np
 
 from slrig.bundle import DESCRIPTION, natural_sort_key, write_file
 from slrig.errors import BundleError
-from slrig.importers.detection import Light, sample_image
+from slrig.importers.detection import Light, sample_image, sample_step_px
 from slrig.importers.images import ENDINGS, SourceImage, list_images
 from slrig.importers.orders import pattern_words
 from slrig.importers.understanding import Understanding, understand
@@ -217,13 +217,17 @@ def _understand(
         found.alone += [each for each in pictures if each.form != form]
         if len(own) < _MIN_IMAGES:
             if len(groups) == 1:
-                raise BundleError(f"expected at least {_MIN_IMAGES} images of a camera, found {len(own)}")
+                raise BundleError(
+                    f"expected at least {_MIN_IMAGES} images of a camera, found {len(own)}: the steps of one period "
+                    "number nothing"
+                )
             found.alone += own
             continue
         names = [each.image.name for each in own]
         understood = understand(
-            [each.samples for each in own], projector, names.__getitem__, cell_px=cell_px, offset_px=offset_px
-        )
+            [each.samples for each in own], projector, names.__getitem__, cell_px=cell_px, offset_px=offset_px,
+            step_px=sample_step_px(form.size.shape),
+        )  # fmt: skip
         found.cameras[name] = (own, understood)
     if not found.cameras:
         raise BundleError(f"{len(groups)} cameras of fewer than {_MIN_IMAGES} images each")

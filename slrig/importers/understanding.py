@@ -1,8 +1,10 @@
-"""Which patterns the images of one camera show, and what remains doubtful: `detection` and `shifted` together."""
+"""Which patterns the images of one camera show, and what remains doubtful: `detection` and `shifted` together, or
+`sinusoid_sets`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -30,6 +32,7 @@ from slrig.importers.detection import (
     replace_units,
 )
 from slrig.importers.shifted import ShiftedLines, find_lines, position_map, shifted_units
+from slrig.importers.sinusoid_sets import SinusoidSet, find_sinusoids
 from slrig.model import Axis, Black, Gray, LineShift, Pattern, Sine, Size, White
 from slrig.patterns import gray_bits
 
@@ -78,14 +81,36 @@ def understand(
     *,
     cell_px: int | None = None,
     offset_px: int | None = None,
+    step_px: int = 1,
 ) -> Understanding:
     """Return what the images of one camera show, in the order of the sequence.
 
-    samples : (3, h, w) of each image, see `sample_image`. name : of an image by its place. cell_px, offset_px : of the
-    code, where they are known.
+    samples : (3, h, w) of each image, see `sample_image`; step_px : pixels from one sample to the next. name : of an
+    image by its place. cell_px, offset_px : of the code, where they are known.
 
-    Raises BundleError: the images are no Gray code, with what they seem to be.
+    Raises BundleError: the images are neither a Gray code nor sinusoids that number positions, with what they seem to
+    be.
     """
+    code: Understanding | None = None
+    failure: BundleError | None = None
+    try:
+        code = _understand_code(samples, projector, name, cell_px=cell_px, offset_px=offset_px)
+    except BundleError as cause:
+        failure = cause
+    if code is not None and not code.doubts:
+        return code
+    sinusoids = find_sinusoids(samples, projector, step_px=step_px)
+    if isinstance(sinusoids, SinusoidSet):
+        return _describe_sinusoids(sinusoids, len(samples), projector, name)
+    if code is None:
+        raise BundleError(f"{failure}; as sinusoids alone: {sinusoids}") from failure
+    return code
+
+
+def _understand_code(
+    samples: Sequence[Light], projector: Size, name: Names, *, cell_px: int | None, offset_px: int | None
+) -> Understanding:
+    """Return which bits of a Gray code, lines and sinusoids beside it images show. Raises BundleError: none."""
     lit = find_light(samples)
     if lit is None:
         raise BundleError(
@@ -144,6 +169,51 @@ def understand(
     _describe(found, lit, reading, projector, name, pairs=pairs)
     _doubt(found, looks, reading, rivals, chains, projector, name, hint=cell_px)
     return found
+
+
+def _describe_sinusoids(sinusoids: SinusoidSet, count: int, projector: Size, name: Names) -> Understanding:
+    """Say which sinusoids images show, and what else they may be."""
+    found = Understanding([sinusoids.references.get(index) for index in range(count)])
+    for kind in (White(), Black()):
+        named = [name(index) for index, shown in sinusoids.references.items() if shown == kind]
+        found.facts.append(f"{kind.kind}: {', '.join(named)}" if named else f"no {kind.kind} image")
+    for copy, original in sinusoids.copies.items():
+        found.doubts.append(Doubt(f"{name(copy)} is a copy of {name(original)}: left out", (copy,), is_fault=True))
+        found.left_out[copy] = "a copy"
+    for each in sinusoids.axes:
+        axis, images = each.axis, tuple(sorted(each.shown))
+        for image, sine in each.shown.items():
+            found.patterns[image] = sine
+        steps = [sum(sine.period_px == period for sine in each.shown.values()) for period in each.periods_px]
+        first, last = (min(max(round(end), 0), projector.along(axis) - 1) for end in each.visible_px)
+        found.facts.append(
+            f"sinusoids of {axis}s without a code, periods of {_numbers(each.periods_px)} px in {_numbers(steps)} "
+            f"steps: {name(images[0])} to {name(images[-1])}; {axis}s {first} to {last} of {projector.along(axis)} are "
+            "visible to a camera that stands upright"
+        )
+        if each.other_periods_px:
+            others = " or ".join(map(_numbers, each.other_periods_px[:2]))
+            text = (
+                f"the periods of {axis}s are taken as {_numbers(each.periods_px)} px, by the projector's extent; the "
+                f"images fit {others} px as well: if they are others, state them by --pattern, as "
+                f"'{axis}s-sine:{each.periods_px[0]:g}/{steps[0]}', or by --list"
+            )
+            found.doubts.append(Doubt(text, images))
+        if each.is_start_unsure:
+            sine = each.shown[images[0]]
+            text = (
+                f"the sinusoids of {axis}s may begin at another place than {sine.shift}/{sine.steps} of their periods, "
+                "which moves all positions: if so, state them by --list"
+            )
+            found.doubts.append(Doubt(text, images))
+        if each.is_mixed:
+            text = f"some sinusoids of {axis}s are shifted forward and others backward: no program is known to do so"
+            found.doubts.append(Doubt(text, images))
+    return found
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return ", ".join(f"{each:.6g}" for each in values)
 
 
 def _chains(looks: Looks) -> tuple[dict[Axis, Chain], bool, bool]:

@@ -46,6 +46,7 @@ from slrig.model.lens import LENS_TERMS
 from slrig.model.noise import MIN_RANGE_SIGMA, NoiseModel, fit_noise
 from slrig.model.patterns import (
     MIN_LINE_STEPS,
+    MIN_SINE_PERIOD_PX,
     Black,
     Gray,
     Integers,
@@ -100,6 +101,7 @@ __all__ = [
     "MIN_EXPOSURES",
     "MIN_LINE_STEPS",
     "MIN_RANGE_SIGMA",
+    "MIN_SINE_PERIOD_PX",
     "MM_PER_UNIT",
     "AlbedoMark",
     "Axis",

@@ -1,31 +1,40 @@
-"""A hundred folders of rendered images as other programs leave them: how many `slrig import` understands by itself."""
+"""Folders of rendered images as other programs leave them: how many `slrig import` understands by itself."""
 
 from __future__ import annotations
 
 import shutil
 import sys
 from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 
-from tests.rendered_folders import understand_folder_of
-
-FOLDERS = 100
-LEAST = 97
+from tests.rendered_folders import Folder, make_folder, make_sinusoid_folder, understand_folder_of
 
 
-def test_a_hundred_folders_are_understood(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("make", "seeds", "least"),
+    [(make_folder, range(100), 97), (make_sinusoid_folder, range(1000, 1030), 29)],
+    ids=["codes", "sinusoids alone"],
+)
+def test_folders_are_understood(
+    make: Callable[[int, Path], Folder],
+    seeds: Sequence[int],
+    least: int,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     verdicts: Counter[str] = Counter()
     lines = []
-    for seed in range(FOLDERS):
+    for seed in seeds:
         path = tmp_path / str(seed)
-        folder, verdict = understand_folder_of(seed, path)
+        folder, verdict = understand_folder_of(seed, path, make)
         verdicts[verdict] += 1
         if verdict not in ("right", "named"):
-            lines.append(f"{seed:3} {verdict}: {', '.join(folder.kinds)}")
+            lines.append(f"{seed:4} {verdict}: {', '.join(folder.kinds)}")
         shutil.rmtree(path)
     with capsys.disabled():
         sys.stdout.write("\n".join([*lines, str(dict(verdicts)), ""]))
     assert verdicts["wrong in silence"] == 0
-    assert verdicts["right"] + verdicts["named"] >= LEAST
+    assert verdicts["right"] + verdicts["named"] >= least

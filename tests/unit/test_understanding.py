@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +10,7 @@ import pytest
 
 from slrig.errors import BundleError
 from slrig.importers.detection import sample_image
+from slrig.importers.orders import ProjectorCode, slstudio_micro_sequence
 from slrig.importers.understanding import Understanding, understand
 from slrig.model import Axis, Black, FloatArray, Gray, LineShift, Pattern, Pixels, Sine, Size, White
 from tests.rendered_folders import pattern_light
@@ -149,10 +150,50 @@ def test_sinusoids_beside_a_code_are_named(cell: int, period: float, steps: int)
     assert understood(photographed(shown)).patterns == shown
 
 
-def test_phase_shifts_without_a_code_are_refused_by_name() -> None:
-    periods = [*ENDS, *(Sine(Axis.COLUMN, period, k, 4) for period in (200.0, 50.0, 12.5) for k in range(4))]
-    with pytest.raises(BundleError, match="8 images change smoothly, as phase shifts of several periods do"):
-        understood(photographed(periods, camera=(210, 280)))
+def shifted(axis: Axis, *periods: float, steps: int, backward: bool = False) -> list[list[Pattern]]:
+    """Images of each period."""
+    return [[Sine(axis, period, -k % steps if backward else k, steps) for k in range(steps)] for period in periods]
+
+
+def joined(groups: Iterable[Sequence[Pattern]]) -> list[Pattern]:
+    return [each for group in groups for each in group]
+
+
+SINUSOIDS: dict[str, list[Pattern]] = {
+    "three periods": [*ENDS, *joined(shifted(Axis.COLUMN, 200, 50, 10, steps=4))],
+    "two periods in three steps": joined(shifted(Axis.COLUMN, 20, 200, steps=3)),
+    "shifted backward, references last": [*joined(shifted(Axis.COLUMN, 200, 40, 10, steps=5, backward=True)), *ENDS],
+    "no period over the projector": [*ENDS, *joined(shifted(Axis.COLUMN, 200 / 13, 200 / 11, 20, steps=4))],
+    "both axes, a step of each period": [
+        *ENDS,
+        *joined(zip(*shifted(Axis.COLUMN, 200, 25, steps=4), strict=True)),
+        *joined(zip(*shifted(Axis.ROW, 75, 15, steps=4), strict=True)),
+    ],
+    "micro phase shift": list(slstudio_micro_sequence(ProjectorCode(PROJECTOR), 12)),
+}
+
+
+@pytest.mark.parametrize("kind", SINUSOIDS)
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+def test_sinusoids_of_several_periods_are_found_from_the_images(kind: str, gamma: float) -> None:
+    images = [(255 * (each / 255) ** gamma).astype(np.uint8) for each in photographed(SINUSOIDS[kind])]
+    found = understood(images)
+    assert found.patterns == SINUSOIDS[kind]
+    assert not found.doubts
+
+
+def test_periods_that_the_images_do_not_determine_are_doubtful() -> None:
+    found = understood(photographed([*ENDS, *joined(shifted(Axis.COLUMN, 256, 64, 16, steps=4))]))
+    assert len(found.doubts) == 1
+    assert "256, 64, 16" in found.doubts[0].text
+    assert "state them by --pattern" in found.doubts[0].text
+
+
+def test_sinusoids_that_nothing_numbers_are_refused_by_name() -> None:
+    with pytest.raises(BundleError, match="one period of columns, and nothing numbers its periods"):
+        understood(photographed(joined(shifted(Axis.COLUMN, 25, steps=4))))
+    with pytest.raises(BundleError, match="2 periods of columns, as 1 : 2 in number, turn more than once"):
+        understood(photographed(joined(shifted(Axis.COLUMN, 25, 12.5, steps=4))))
 
 
 def test_too_few_bits_for_the_projector_are_said() -> None:
