@@ -88,8 +88,8 @@ def import_images(
 ) -> None:
     """Make a bundle of another program's images.
 
-    The images themselves tell which Gray codes and lines they show; a picture beside the bundle shows what each was
-    taken for. Or state the order of a program, or names. Then: slrig reconstruct.
+    The images themselves tell which Gray codes, lines and sinusoids they show; a picture beside the bundle shows what
+    each was taken for. Or state the order of a program, or names. Then: slrig reconstruct.
     """
     from slrig.importers import ImageNaming, ProjectorCode, assign_images, import_capture, parse_size, write_list
 

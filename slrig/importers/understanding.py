@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -479,6 +480,14 @@ def _doubt(
     if len(lone) == 1:
         (kind, image), other = lone[0], "black" if flat[White()] else "white"
         doubts.append(Doubt(f"{name(image)} is taken for {kind}, and no image for {other}", (image,)))
+    for kind, images in flat.items():
+        numbered = [image for image in images if re.search(r"\d", name(image))]
+        if numbered and len(numbered) < len(images):
+            others = sorted(set(images) - set(numbered))
+            text = (
+                f"{_listed(others, name)} is taken for {kind.kind}, and has no number as {_listed(numbered, name)} has"
+            )
+            doubts.append(Doubt(text, tuple(others)))
     strange = [i for i, each in enumerate(found.patterns) if each is None and i not in found.left_out]
     found.left_out |= dict.fromkeys(strange, "fits no pattern of the set")
     if strange:
