@@ -49,6 +49,7 @@ _MISSING, _EXTRA, _WRONG, _EXCHANGED = 1.3, 1.6, 4.0, 1.8  # costs of an order o
 _DARK = 0.15  # level of an image of no light, and distance from 1 of white
 _UNEVEN, _APART = 1.6, 0.4  # cost over a difference of levels; least one of a constant bit and its inverse
 _MAX_CHANGES = 4  # of the axis in a sequence that plays one after the other
+_DROP, _MAX_DROP = 0.05, 4.0  # of the agreement with a Gray code, for each octave more that a finer bit has fewer edges
 _UNUSUAL = 4.0  # cost of bits neither from coarse to fine nor from fine to coarse: more than two exchanged images
 _MAX_COST = 6.0
 _CLEAR = 0.72  # swing of a bit, after which the next finer one is still resolved
@@ -261,7 +262,9 @@ def _unit(lit: Lit, images: tuple[int, ...]) -> Unit:
     swing = light[0] - light[1] if len(images) == 2 else 2 * light[0] - 1
     sign = swing > 0
     across, down = (float((sign[0] != sign[plane]).mean()) for plane in (1, 2))
-    ratio = across / max(across + down, 1e-9)
+    # Where there is little light, noise makes edges in all directions.
+    clear = [(sign[0] != sign[plane]) * np.minimum(np.abs(swing[0]), np.abs(swing[plane])) for plane in (1, 2)]
+    ratio = float(clear[0].sum()) / max(float(clear[0].sum() + clear[1].sum()), 1e-9)
     few = max(across, down) * sign.shape[1] < _MIN_EDGES
     axis = None if few or 0.42 <= ratio <= 0.58 else Axis.COLUMN if ratio > 0.5 else Axis.ROW
     # What the camera does not resolve has little swing; without an inverse, it may be far from the middle.
@@ -363,6 +366,9 @@ def _fitness(nesting: _Nesting, units: Sequence[Unit], order: Sequence[int], *, 
     # Where a bit is missing, the next finer one is dark at the edges of the next coarser one too.
     without = usual * (weight * -np.abs(expected) * mean).sum(axis=0)
     agreement = float(np.maximum.reduce([usual * votes, _TURNED * np.abs(votes), _TURNED * without]).sum())
+    # A finer bit has more edges, but for the few of coarse ones.
+    drops = -np.diff([units[k].density for k in order])
+    agreement -= _DROP * float(np.maximum(drops - _MAX_DROP, 0).sum()) * float(weight.sum())
     steps = np.sign(np.diff([units[k].place for k in order])) * (-1 if backward else 1)
     bonus = 0.01 * float(np.mean(steps)) if len(steps) else 0.0
     return agreement / max(float(weight.sum()), 1e-9) + bonus

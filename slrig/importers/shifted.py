@@ -49,7 +49,14 @@ def shifted_units(looks: Looks) -> list[list[Unit]]:
                 runs.append([])
             runs[-1].append(unit)
         groups += runs
-    found = [run for run in groups if len(run) > 1 and sum(len(each.images) for each in run) >= MIN_LINE_STEPS]
+    # The last bits of a code, which the camera hardly resolves, have as many edges as each other too.
+    found = [
+        run
+        for run in groups
+        if len(run) > 1
+        and sum(len(each.images) for each in run) >= MIN_LINE_STEPS
+        and not all(each.is_weak for each in run)
+    ]
     for run in found:
         # What the camera hardly resolves stands between the others.
         first, last = min(unit.images[0] for unit in run), max(unit.images[-1] for unit in run)

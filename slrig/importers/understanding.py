@@ -420,6 +420,10 @@ def _doubt(
     hint: int | None,
 ) -> None:
     doubts, order = found.doubts, reading.order
+    resolved = {image for unit in looks.units if not unit.is_weak for image in unit.images}
+    striped = {
+        (each.axis, each.bit) for i, each in enumerate(found.patterns) if isinstance(each, Gray) and i in resolved
+    }
     for copy, original in looks.copies.items():
         if found.patterns[copy] is not None:
             continue
@@ -461,15 +465,18 @@ def _doubt(
                 f"{place.bits} bits with cells of 1 px would end at {axis} {reach - 1}, the projector has "
                 f"{projector.along(axis)}: taken as cells of {place.cell_px} px; if they are others, state --cell-px"
             ))  # fmt: skip
+        finest = max(bit for own, bit in striped if own is axis)
+        if place.bits == whole - 1 > finest + 1 and not has_lines and hint is None:
+            doubts.append(Doubt(
+                f"the camera does not resolve {axis} bit {finest + 1} and finer ones, so cells of 1 px, of which the "
+                "images of one bit are missing, would look the same: state --cell-px"
+            ))  # fmt: skip
         if (text := _bit_order(found.patterns, axis)) not in _USUAL_ORDERS and not order.exchanged:
             doubts.append(Doubt(f"the bits of {axis}s come {text}, by what they show: no program is known to do so"))
         if chains[axis].sureness < _MIN_SURENESS or reading.disorder[axis] > _MAX_DISORDER:
             doubts.append(
                 Doubt(f"the bits of {axis}s hardly nest as a Gray code does: too much noise, or another code")
             )
-    striped = {
-        (each.axis, each.bit) for i, each in enumerate(found.patterns) if isinstance(each, Gray) and i not in looks.flat
-    }
     for index in looks.flat:
         shown = found.patterns[index]
         if isinstance(shown, Gray) and (shown.axis, shown.bit) in striped:
@@ -478,8 +485,8 @@ def _doubt(
     flat = {kind: [i for i, each in enumerate(found.patterns) if each == kind] for kind in (White(), Black())}
     lone = [(kind.kind, images[0]) for kind, images in flat.items() if images]
     if len(lone) == 1:
-        (kind, image), other = lone[0], "black" if flat[White()] else "white"
-        doubts.append(Doubt(f"{name(image)} is taken for {kind}, and no image for {other}", (image,)))
+        (taken, image), other = lone[0], "black" if flat[White()] else "white"
+        doubts.append(Doubt(f"{name(image)} is taken for {taken}, and no image for {other}", (image,)))
     for kind, images in flat.items():
         numbered = [image for image in images if re.search(r"\d", name(image))]
         if numbered and len(numbered) < len(images):
