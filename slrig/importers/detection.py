@@ -557,11 +557,13 @@ def _templates(
     spare = sum(1 for each in images if each.bit < 0)
     each_takes = 2 if levels.pairs else 1
     gaps = {axis: _first_gap(images, axis) for axis in axes}
-    span = range(_MAX_HIDDEN + 1)
+    # A small object hides many coarse bits: images that light parts of it, without an edge.
+    loose = sum(each.is_loose for each in images) // each_takes
+    first, last = range(max(_MAX_HIDDEN, loose) + 1), range(_MAX_HIDDEN + 1)
     ends = [
         [
             each
-            for each in product(span, range(2) if gaps[axis] else (0,), span)
+            for each in product(first, range(2) if gaps[axis] else (0,), last)
             if sum(each) * each_takes <= spare + 1 and resolved[axis] + sum(each) <= full[axis] + 3
         ]
         for axis in axes
@@ -916,7 +918,9 @@ def _places(bits: int, extent_px: int, cell_px: int | None, offset_px: int | Non
         ):
             if offset < 0 or (offset, mirrored) in tried or (offset_px is not None and offset != offset_px):
                 continue
-            if max(1, ((extent_px - 1 + offset) // cell).bit_length()) != bits:
+            needed = max(1, ((extent_px - 1 + offset) // cell).bit_length())
+            # The shorter axis may have the bits of the longer one, of which the first are constant.
+            if needed != bits and not (needed < bits and cell == 1 and not offset and not mirrored):
                 continue
             tried.add((offset, mirrored))
             is_power = cell & (cell - 1) == 0
