@@ -232,9 +232,12 @@ def look_at(lit: Lit) -> Looks:
         looks.units.append(_unit(lit, pair))
     known = [each for each in looks.units if each.axis is not None and not each.is_weak]
     for place, unit in enumerate(looks.units):
-        # Few edges, as of coarse bits, need not tell the direction: that of the next image in the sequence does.
+        # Few edges, as of coarse bits, need not tell the direction: that of the image before or after it does, of the
+        # one that has nearly as many.
         if unit.axis is None and not unit.is_weak and not unit.is_loose and known:
-            axis = min(known, key=lambda each: abs(each.place - unit.place)).axis
+            beside = [*[each for each in known if each.place < unit.place][-1:],
+                      *[each for each in known if each.place > unit.place][:1]]  # fmt: skip
+            axis = min(beside, key=lambda each: abs(each.density - unit.density)).axis
             looks.units[place] = replace(unit, axis=axis)
     return looks
 
@@ -262,9 +265,7 @@ def _unit(lit: Lit, images: tuple[int, ...]) -> Unit:
     swing = light[0] - light[1] if len(images) == 2 else 2 * light[0] - 1
     sign = swing > 0
     across, down = (float((sign[0] != sign[plane]).mean()) for plane in (1, 2))
-    # Where there is little light, noise makes edges in all directions.
-    clear = [(sign[0] != sign[plane]) * np.minimum(np.abs(swing[0]), np.abs(swing[plane])) for plane in (1, 2)]
-    ratio = float(clear[0].sum()) / max(float(clear[0].sum() + clear[1].sum()), 1e-9)
+    ratio = across / max(across + down, 1e-9)
     few = max(across, down) * sign.shape[1] < _MIN_EDGES
     axis = None if few or 0.42 <= ratio <= 0.58 else Axis.COLUMN if ratio > 0.5 else Axis.ROW
     # What the camera does not resolve has little swing; without an inverse, it may be far from the middle.

@@ -70,6 +70,10 @@ ORDERS: dict[str, list[Pattern]] = {
     "neither white nor black nor inverses": list(bits(Axis.COLUMN, inverses=False)),
     "wider cells": [*ENDS, *bits(Axis.COLUMN, cell=2)],
     "centred": [*ENDS, *bits(Axis.COLUMN, offset=28), *bits(Axis.ROW, offset=90)],
+    "as many bits of rows as of columns": [
+        *COLUMNS,
+        *(Gray(Axis.ROW, bit, 8, inverted=inverted) for bit in range(8) for inverted in (False, True)),
+    ],
     "lines": [*ENDS, *bits(Axis.COLUMN, cell=4), *LINES],
 }
 WITH_A_TWIN = ("both axes, references last", "inverses after all bits", "wider cells")
