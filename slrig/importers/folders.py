@@ -25,6 +25,11 @@ _MAX_GROUPINGS = 8
 _GOOD_COST = 1.0
 _OTHER_CODES = 2.0  # cost of cameras that see different codes: likelier one camera's images of both axes
 _THUMBNAIL_PX = 168
+_REFERENCES = {
+    "white", "black", "bright", "dark", "light", "on", "off", "full", "all", "none", "max", "min", "high", "low", "lit",
+    "blank", "ambient", "reference", "ref", "texture", "color", "colour", "albedo", "inverse", "inv", "neg", "pos",
+}  # fmt: skip
+"""Words of images without a number that belong to a sequence."""
 
 Groups = dict[str, list[SourceImage]]
 
@@ -215,6 +220,12 @@ def _understand(
                 f"found images of {len({each.form for each in pictures})} extents or depths as one camera"
             )
         found.alone += [each for each in pictures if each.form != form]
+        unnumbered = [each for each in own if not re.search(r"\d", each.image.stem)]
+        if 0 < len(unnumbered) <= max(2, len(own) // 10) and not any(
+            _REFERENCES & set(re.findall(r"[a-z]+", each.image.stem.lower())) for each in unnumbered
+        ):
+            own = [each for each in own if re.search(r"\d", each.image.stem)]
+            found.alone += unnumbered
         if len(own) < _MIN_IMAGES:
             if len(groups) == 1:
                 raise BundleError(

@@ -97,7 +97,7 @@ def an_engine_that_another_program_holds_is_busy(table: Table, notes: Notes) -> 
     other = os.open(path, os.O_RDWR)
     try:
         fcntl.flock(other, fcntl.LOCK_EX)
-        with pytest.raises(DeviceBusyError, match="another program holds it") as busy:
+        with pytest.raises(DeviceBusyError, match="another program holds the light engine") as busy:
             table.opened()
         notes["says"] = str(busy.value)
     finally:
