@@ -14,7 +14,7 @@ from slrig.model import MIN_LINE_STEPS, Axis, FloatArray, LineShift, Sine
 
 _SAME_DENSITY = 0.4  # octaves
 _NEAR_DENSITY = 0.8  # octaves, of patterns that come next to those of one period
-_RESOLVED = 0.5  # swing of lines over the range
+_ALIKE = 0.6  # swing of lines over that of the clearest ones of the same period
 _MAX_SPREAD = 1.5  # octaves, of lines of one period
 _FINE = -5.5  # log2 of edges per pixel: coarser bits may have equally many by chance
 _WINDOW, _MAX_WINDOW, _CELLS = 5, 61, 2.0  # samples and cells, over which the position of cells is averaged
@@ -56,7 +56,7 @@ def shifted_units(looks: Looks) -> list[list[Unit]]:
         for run in groups
         if len(run) > 1
         and sum(len(each.images) for each in run) >= MIN_LINE_STEPS
-        and max(each.strength for each in run) > _RESOLVED
+        and min(each.strength for each in run) > _ALIKE * max(each.strength for each in run)
     ]
     for run in found:
         # What the camera hardly resolves stands between the others.

@@ -42,6 +42,7 @@ Names = Callable[[int], str]
 _MAX_READ = 6  # orders whose codes are placed on the projector
 _USUAL_ORDERS = ("coarse to fine", "fine to coarse")
 _MAX_PHOTOGRAPHS = 2
+_DARK = 0.12  # level of black images at a usual exposure
 _LINES_FIT = 1.0  # cost of a reading over the best, that lines of a period of its code outweigh
 _PLAUSIBLE = 1.6  # cost of a reading, above which images may have been turned
 _MIN_SURENESS = 0.45
@@ -168,7 +169,7 @@ def _understand_code(
             found.patterns[image] = pattern
         _describe_lines(found, lines, name)
     _describe(found, lit, reading, projector, name, pairs=pairs)
-    _doubt(found, looks, reading, rivals, chains, projector, name, hint=cell_px)
+    _doubt(found, lit, looks, reading, rivals, chains, projector, name, hint=cell_px)
     return found
 
 
@@ -410,6 +411,7 @@ def _bit_order(patterns: Sequence[Pattern | None], axis: Axis) -> str:
 
 def _doubt(
     found: Understanding,
+    lit: Lit,
     looks: Looks,
     reading: Reading,
     rivals: Sequence[Reading],
@@ -487,6 +489,10 @@ def _doubt(
     if len(lone) == 1:
         (taken, image), other = lone[0], "black" if flat[White()] else "white"
         doubts.append(Doubt(f"{name(image)} is taken for {taken}, and no image for {other}", (image,)))
+    grey = [image for image in flat[Black()] if lit.level[image] > _DARK]
+    if grey and len(grey) == len(flat[Black()]) and any(place.cell_px > 1 for place in reading.places.values()):
+        text = "is taken for black, but is lighter than between stripes, as a bit is that the camera does not resolve"
+        doubts.append(Doubt(f"{_listed(grey, name)} {text}", tuple(grey)))
     for kind, images in flat.items():
         numbered = [image for image in images if re.search(r"\d", name(image))]
         if numbered and len(numbered) < len(images):
