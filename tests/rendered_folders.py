@@ -207,10 +207,7 @@ def make_folder(seed: int, path: Path, *, scene_number: int | None = None) -> Fo
         shown, profiles = [*shown[1:], shown[0]], [*profiles[1:], profiles[0]]
     images = _photographed(chance, stage, profiles, folder.kinds)
     if fault == "twice":
-        place = chance.randrange(1, len(shown))
-        folder.kinds.append(f"twice {shown[place]}")
-        shown.insert(place, shown[place])
-        images.insert(place, images[place].copy())
+        _double_one(chance, folder, shown, images)
     _write(chance, folder, shown, images)
     if fault == "lone":
         room = cv2.GaussianBlur(
@@ -287,12 +284,16 @@ def make_sinusoid_folder(seed: int, path: Path) -> Folder:
     profiles = [pattern_light(each, stage.size) for each in shown if each is not None]
     images = _photographed(chance, stage, profiles, folder.kinds)
     if fault == "twice":
-        place = chance.randrange(1, len(shown))
-        folder.kinds.append(f"twice {shown[place]}")
-        shown.insert(place, shown[place])
-        images.insert(place, images[place].copy())
+        _double_one(chance, folder, shown, images)
     _write(chance, folder, shown, images)
     return folder
+
+
+def _double_one(chance: random.Random, folder: Folder, shown: list[Pattern | None], images: list[Pixels]) -> None:
+    place = chance.randrange(1, len(shown))
+    folder.kinds.append(f"twice {shown[place]}")
+    shown.insert(place, shown[place])
+    images.insert(place, images[place].copy())
 
 
 def _write(chance: random.Random, folder: Folder, shown: Sequence[Pattern | None], images: Sequence[Pixels]) -> None:

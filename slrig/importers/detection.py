@@ -367,7 +367,7 @@ def _fitness(nesting: _Nesting, units: Sequence[Unit], order: Sequence[int], *, 
     # Where a bit is missing, the next finer one is dark at the edges of the next coarser one too.
     without = usual * (weight * -np.abs(expected) * mean).sum(axis=0)
     agreement = float(np.maximum.reduce([usual * votes, _TURNED * np.abs(votes), _TURNED * without]).sum())
-    # A finer bit has more edges, but for the few of coarse ones.
+    # A finer bit has more edges than a coarser one; the coarsest have so few that chance decides.
     drops = -np.diff([units[k].density for k in order])
     agreement -= _DROP * float(np.maximum(drops - _MAX_DROP, 0).sum()) * float(weight.sum())
     steps = np.sign(np.diff([units[k].place for k in order])) * (-1 if backward else 1)

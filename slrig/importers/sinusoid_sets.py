@@ -396,7 +396,7 @@ def _number(
             f"{len(periods)} periods of {axis}s, as {rates} in number, turn more than once over what is visible, as do "
             "their differences: nothing numbers them"
         )
-    return _placed(periods, phases, axis, best[1], best[2], extent, others_px)
+    return _place_periods(periods, phases, axis, best[1], best[2], extent, others_px)
 
 
 def _calm(phase: Phasors, rate: float, grid: _Grid) -> _Signal:
@@ -486,7 +486,7 @@ def _whole_numbers(ratio: FloatArray, visible: float) -> list[tuple[float, tuple
     return sorted((cost, key) for key, cost in found.items())[:_MAX_SETS]
 
 
-def _placed(
+def _place_periods(
     periods: Sequence[_Period],
     phases: Sequence[Phasors],
     axis: Axis,

@@ -467,7 +467,7 @@ def _doubt(
                 f"{place.bits} bits with cells of 1 px would end at {axis} {reach - 1}, the projector has "
                 f"{projector.along(axis)}: taken as cells of {place.cell_px} px; if they are others, state --cell-px"
             ))  # fmt: skip
-        finest = max(bit for own, bit in striped if own is axis)
+        finest = max((bit for own, bit in striped if own is axis), default=-1)
         if place.bits == whole - 1 > finest + 1 and not has_lines and hint is None:
             doubts.append(Doubt(
                 f"the camera does not resolve {axis} bit {finest + 1} and finer ones, so cells of 1 px, of which the "
