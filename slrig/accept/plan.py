@@ -169,6 +169,11 @@ class AcceptancePlan:
         )
 
 
+def takes_of(plan: AcceptancePlan, step: str) -> list[tuple[Step, int]]:
+    """The captures of one position, in order."""
+    return [take for take in plan.takes if take[0].name == step]
+
+
 def diagonal_mm(volume_mm: FloatArray) -> float:
     """The space diagonal of a box of two opposite corners, (2, 3) float64, mm."""
     return float(np.linalg.norm(volume_mm[1] - volume_mm[0]))

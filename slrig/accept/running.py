@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from slrig.accept.evaluation import Reading, reading
 from slrig.accept.plan import AcceptancePlan, Step
@@ -29,10 +30,8 @@ from slrig.errors import (
 from slrig.jobs.records import utc_now
 from slrig.model import Calibration
 from slrig.scan.acquisition import capture_frames
-from slrig.scan.artefacts import decode_mesh_ply
+from slrig.scan.artefacts import MESH, decode_mesh_ply
 from slrig.scan.plan import ProgressCallback, ReconstructionPlan, ScanPlan
-
-_BUNDLE, _MESH = "bundle", "mesh"
 
 Place = Callable[[Rig, Step], None]
 """Brings the artefact of a step to its place, before each capture but those that repeat one without a move; returns
@@ -42,8 +41,25 @@ Evaluate = Callable[..., Reading]
 """`evaluated`, or a way to have it done elsewhere."""
 
 
+def bundle_name(step: Step, take: int) -> str:
+    """The folder of a capture's frames."""
+    return f"{step.name}-{take + 1}"
+
+
+def capture_take(
+    rig: Rig, plan: AcceptancePlan, bundle: Path, *, progress: ProgressCallback, cancelled: Callable[[], bool]
+) -> None:
+    """Record a bundle of the artefact that stands before the rig. Raises CalibrationError, and as a scan."""
+    calibration = required_calibration(rig)
+    # The test must not use what a rendered rig knows of its scene; and the noise of a point, which is told beside its
+    # form, is to hold nothing of the calibration's own error, which is what form is to show.
+    blind = replace(rig, head=None, calibration=replace(calibration, solved=None))
+    scan = ScanPlan(exposure_s=plan.exposure_s)
+    capture_frames(blind, scan, bundle, progress=progress, cancelled=cancelled).finish()
+
+
 def evaluated(
-    work: Path,
+    bundle: Path,
     folder: Path,
     plan: AcceptancePlan,
     step: Step,
@@ -53,13 +69,15 @@ def evaluated(
     progress: ProgressCallback,
     cancelled: Callable[[], bool],
 ) -> Reading:
-    """Reconstruct the bundle in `work`, measure the artefact in its mesh, and keep its points in `folder`."""
+    """Reconstruct a bundle, measure the artefact in its mesh, and keep its points in `folder`."""
     # The process that owns the rig loads the mathematics only if it has to do it itself.
     from slrig.scan.reconstruct import reconstruct_bundle
 
-    reconstruct_bundle(work / _BUNDLE, work / _MESH, plan=ReconstructionPlan(), progress=progress, cancelled=cancelled)
-    with storage_errors(work):
-        mesh = decode_mesh_ply((work / _MESH / "mesh.ply").read_bytes())
+    with TemporaryDirectory(dir=bundle.parent, prefix=".mesh-") as scratch:
+        made = Path(scratch) / "mesh"
+        reconstruct_bundle(bundle, made, plan=ReconstructionPlan(), progress=progress, cancelled=cancelled)
+        with storage_errors(made):
+            mesh = decode_mesh_ply((made / MESH).read_bytes())
     found, evidence = reading(mesh, step, take, plan)
     keep_points(evidence, folder, step.name, take)
     return found
@@ -155,18 +173,14 @@ def _captured(
     cancelled: Callable[[], bool],
     evaluate: Evaluate,
 ) -> Reading:
-    calibration = required_calibration(rig)
     work = folder / f".{step.name}-{take + 1}"
     shutil.rmtree(work, ignore_errors=True)
     try:
         with storage_errors(work):
             work.mkdir(parents=True)
-        scan = ScanPlan(exposure_s=plan.exposure_s)
-        # The test must not use what a rendered rig knows of its scene; and the noise of a point, which is told beside
-        # its form, is to hold nothing of the calibration's own error, which is what form is to show.
-        blind = replace(rig, head=None, calibration=replace(calibration, solved=None))
-        capture_frames(blind, scan, work / _BUNDLE, progress=progress, cancelled=cancelled).finish()
-        return evaluate(work, folder, plan, step, take, progress=progress, cancelled=cancelled)
+        bundle = work / bundle_name(step, take)
+        capture_take(rig, plan, bundle, progress=progress, cancelled=cancelled)
+        return evaluate(bundle, folder, plan, step, take, progress=progress, cancelled=cancelled)
     finally:
         shutil.rmtree(work, ignore_errors=True)
 

@@ -1,7 +1,7 @@
 """Acceptance tests on disk, each a folder.
 
 DATA/acceptance/ID/test.json   what is on record of it
-DATA/acceptance/ID/points/POSITION-CAPTURE.npz   the points behind each capture
+DATA/acceptance/ID/positions/POSITION/   a position that was measured: readings.json, and CAPTURE.npz, the points
 DATA/acceptance/ID/report.html, report.json   when every position is measured; the second is written last
 """
 
@@ -18,10 +18,12 @@ from uuid import UUID
 
 import numpy as np
 import structlog
+from pydantic import TypeAdapter
 
-from slrig.accept.evaluation import ReadingPoints
+from slrig.accept.evaluation import Reading, ReadingPoints
 from slrig.accept.records import AcceptanceRecord, AcceptanceState, record_from_json, record_json
 from slrig.bundle import write_file
+from slrig.calibrate.records import plain
 from slrig.calibration import Decision
 from slrig.disk import storage_errors
 from slrig.errors import StorageError
@@ -29,6 +31,10 @@ from slrig.failure import disk_errors
 from slrig.jobs.data_folder import DataFolder, remove
 
 RECORD, HTML, JSON = "test.json", "report.html", "report.json"
+READINGS = "readings.json"
+"""In the folder of a position: what was measured in each capture."""
+
+_readings = TypeAdapter(list[Reading])
 
 _log = structlog.get_logger(__name__)
 
@@ -70,11 +76,17 @@ class AcceptanceStore:
                 found.append(settled)
         return sorted(found, key=lambda record: record.number)
 
+    def readings(self, test_id: UUID, step: str) -> list[Reading]:
+        """What was measured in a position. Raises StorageError."""
+        path = self.folder(test_id) / "positions" / step / READINGS
+        with disk_errors(path):
+            return _readings.validate_json(path.read_bytes())
+
     def save(self, record: AcceptanceRecord) -> None:
         """Put a test on record in place of what it was. Raises StorageError."""
         place = self.folder(record.id)
         with disk_errors(place):
-            place.mkdir(exist_ok=True)
+            (place / "positions").mkdir(parents=True, exist_ok=True)
         write_file(place / RECORD, record_json(record))
 
     def delete(self, test_id: UUID) -> None:
@@ -93,13 +105,24 @@ class AcceptanceStore:
         return replace(record, state=AcceptanceState.FINISHED, decision=decided)
 
 
+def read_test(folder: Path) -> AcceptanceRecord:
+    """A test as its folder has it. Raises StorageError."""
+    with disk_errors(folder):
+        return record_from_json((folder / RECORD).read_bytes(), str(folder / RECORD))
+
+
+def readings_json(readings: Sequence[Reading]) -> bytes:
+    """What was measured in a position, as JSON text."""
+    return (json.dumps(plain(readings), indent=1, allow_nan=False) + "\n").encode()
+
+
 def points_file(step: str, take: int) -> str:
     """Where the points of a capture lie below the folder of their test.
 
     >>> points_file("sphere-1", 0)
-    'points/sphere-1-1.npz'
+    'positions/sphere-1/1.npz'
     """
-    return f"points/{step}-{take + 1}.npz"
+    return f"positions/{step}/{take + 1}.npz"
 
 
 def keep_points(evidence: ReadingPoints, folder: Path, step: str, take: int) -> None:

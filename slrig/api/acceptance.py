@@ -125,13 +125,13 @@ def measure_position(
     idempotency_key: IdempotencyKey = None,
 ) -> AcceptanceBody:
     """Measure the next position, with its repeats; by script, all that are left. The answer comes at once."""
-    desk, wait = service.acceptance, request.if_busy == "queue"
+    tests, wait = service.acceptance, request.if_busy == "queue"
 
     def start(key: str | None) -> UUID:
-        return desk.measure(test_id, wait=wait, scripted=request.scripted, key=key).id
+        return tests.measure(test_id, wait=wait, scripted=request.scripted, key=key).id
 
-    started_once(service.keys, desk.jobs, idempotency_key, f"/acceptance/{test_id}/position", request, start)
-    return _body(desk.get(test_id))
+    started_once(service.keys, service.store, idempotency_key, f"/acceptance/{test_id}/position", request, start)
+    return _body(tests.get(test_id))
 
 
 @router.post("/{test_id}/cancel", status_code=202, responses=problems(507))

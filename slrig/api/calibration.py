@@ -33,8 +33,7 @@ from slrig.api.openapi import file_of, problems
 from slrig.api.schemas import filled, pattern_plan
 from slrig.api.service import Service, Serving
 from slrig.bundle import CAMERA_NAME, MAX_CALIBRATION_BYTES, FreeText, SafeText
-from slrig.calibrate.calibrating import EXPORTS
-from slrig.calibrate.pose_shooting import PoseRequest
+from slrig.calibrate.calibrating import EXPORTS, PoseRequest
 from slrig.calibrate.records import USUAL_PATTERNS, PoseRecord, SessionRecord, pose_of
 from slrig.calibrate.store import REPORT, picture_name
 from slrig.calibration import DEFAULT_BOARD, Board, BoardKind
@@ -64,7 +63,7 @@ def _answered(service: Service, record: SessionRecord) -> CalibrationBody:
         record,
         active=calibrations.active,
         files=_ready_files(service, record),
-        last_event=calibrations.register.jobs.last_event_of(record.id),
+        last_event=service.store.last_event_of(record.id),
     )
 
 
@@ -194,7 +193,7 @@ def shoot_pose(
     asked, wait = PoseRequest(request.position, request.exposure_s), request.if_busy == "queue"
 
     def shoot(key: str | None) -> PoseRecord:
-        return service.calibrations.poses.shoot(calibration_id, asked, wait=wait, key=key)
+        return service.calibrations.shoot(calibration_id, asked, wait=wait, key=key)
 
     return _accepted(service, response, calibration_id, "pose", idempotency_key, request, shoot)
 
@@ -213,7 +212,7 @@ def shoot_script(
     asked, wait = PoseRequest(None, request.exposure_s), request.if_busy == "queue"
 
     def shoot(key: str | None) -> PoseRecord:
-        return service.calibrations.poses.script(calibration_id, request.positions, asked, wait=wait, key=key)
+        return service.calibrations.script(calibration_id, request.positions, asked, wait=wait, key=key)
 
     return _accepted(service, response, calibration_id, "script", idempotency_key, request, shoot)
 
@@ -231,7 +230,7 @@ def _accepted(
     register = service.calibrations.register
     cameras = register.get(calibration_id).cameras
     path = f"/calibration/{calibration_id}/{what}"
-    job = started_once(service.keys, register.jobs, key, path, request, lambda key: shoot(key).id)
+    job = started_once(service.keys, service.store, key, path, request, lambda key: shoot(key).id)
     body = pose_body(calibration_id, pose_of(job), cameras)
     response.headers["Location"] = body.links.self
     return body
@@ -248,14 +247,14 @@ def look_at_pose(service: Serving, calibration_id: UUID, number: int) -> PoseBod
 @router.post("/{calibration_id}/pose/{number}/cancel", status_code=202)
 def cancel_pose(service: Serving, calibration_id: UUID, number: int) -> PoseBody:
     """Ask a pose to end early, and with it the script that it is part of. May be repeated."""
-    pose = service.calibrations.poses.cancel(calibration_id, number)
+    pose = service.calibrations.cancel(calibration_id, number)
     return pose_body(calibration_id, pose, service.calibrations.register.get(calibration_id).cameras)
 
 
 @router.delete("/{calibration_id}/pose/{number}", status_code=204, responses=problems(409, 507))
 def drop_pose(service: Serving, calibration_id: UUID, number: int) -> None:
     """Drop a pose with its frames. The next solve does without it."""
-    service.calibrations.poses.drop(calibration_id, number)
+    service.calibrations.drop(calibration_id, number)
 
 
 @router.post("/{calibration_id}/solve", status_code=202, responses=problems(409, 507))
@@ -263,8 +262,7 @@ def solve_calibration(
     service: Serving, calibration_id: UUID, request: Annotated[SolveRequest, Body(default_factory=SolveRequest)]
 ) -> CalibrationBody:
     """Solve the calibration from its accepted poses. The answer comes at once; `progress` tells how far it is."""
-    solves = service.calibrations.solves
-    return _answered(service, solves.solve(calibration_id, board_shape=request.board_shape))
+    return _answered(service, service.calibrations.solve(calibration_id, board_shape=request.board_shape))
 
 
 @router.post("/{calibration_id}/activate", responses=problems(409, 507))

@@ -15,9 +15,8 @@ from slrig.errors import InvalidInputError, JobNotFoundError, StorageError, Work
 from slrig.jobs.data_folder import BUNDLE, DataFolder
 from slrig.jobs.worker_process import Task
 from slrig.scan.artefacts import MESH, REPORT
+from slrig.scan.job import cloud_bytes
 from slrig.scan.offered import causes_picture, missing_for, requested_forms
-
-MAKER = "slrig.scan.cloud_files:cloud_file"
 
 LONGEST_WAIT_S = 30.0
 """From when on a request that waits for the worker is told to come again: clients wait a minute for an answer."""
@@ -82,7 +81,7 @@ def make_cloud(service: Service, scan_id: UUID, form: str, camera: str | None) -
         try:
             if os.path.lexists(path):
                 return
-            task = Task(MAKER, (place, form, camera), what=f"making of {path.name}", remedy="Ask again.")
+            task = Task(cloud_bytes, (place, form, camera), what=f"making of {path.name}", remedy="Ask again.")
             data = service.worker.run(task, within_s=max(until_s - time.monotonic(), 0.0))
             # From here, not by the worker: where that is killed nothing is left half written.
             service.folder.require_space(len(data) + service.settings.min_free_bytes)

@@ -23,8 +23,7 @@ from slrig.calibrate.register import CalibrationRegister
 from slrig.config import ServiceSettings
 from slrig.errors import CalibrationNotFoundError, JobNotFoundError
 from slrig.failure import JobFailure
-from slrig.jobs.feed import JobFeed
-from slrig.jobs.records import JobEvent, JobState
+from slrig.jobs.records import JobEvent, JobKind, JobState
 from slrig.jobs.store import EVERY_JOB, JobStore
 
 _LAST_WORD_S = 2.0
@@ -197,7 +196,7 @@ _CALIBRATION = _answers(
 @router.get("/scan/{scan_id}/events", tags=["scan"], response_class=Response, responses=_JOB)
 async def follow_scan(place: StreamPlace, service: Serving, scan_id: UUID, last_event_id: LastEventId = 0) -> Response:
     """Follow a scan until it is over. Events that happened before come first."""
-    return await _follow_job(place, service, service.store, scan_id, last_event_id)
+    return await _follow_job(place, service, JobKind.SCAN, scan_id, last_event_id)
 
 
 @router.get("/rig/verification/{verification_id}/events", tags=["health"], response_class=Response, responses=_JOB)
@@ -205,7 +204,7 @@ async def follow_verification(
     place: StreamPlace, service: Serving, verification_id: UUID, last_event_id: LastEventId = 0
 ) -> Response:
     """Follow a verification until it is over. Events that happened before come first."""
-    return await _follow_job(place, service, service.verifications.jobs, verification_id, last_event_id)
+    return await _follow_job(place, service, JobKind.VERIFICATION, verification_id, last_event_id)
 
 
 @router.get("/model/{model_id}/events", tags=["model"], response_class=Response, responses=_JOB)
@@ -213,7 +212,7 @@ async def follow_model(
     place: StreamPlace, service: Serving, model_id: UUID, last_event_id: LastEventId = 0
 ) -> Response:
     """Follow a model until it is over. Events that happened before come first."""
-    return await _follow_job(place, service, service.models.jobs, model_id, last_event_id)
+    return await _follow_job(place, service, JobKind.MODEL, model_id, last_event_id)
 
 
 @router.get(
@@ -227,8 +226,8 @@ async def follow_calibration(
     await run_in_threadpool(register.get, calibration_id)
     followed = Followed(
         partial(_look_at_calibration, register, calibration_id),
-        partial(register.jobs.watch, calibration_id),
-        partial(register.jobs.last_event_of, calibration_id),
+        partial(service.store.watch, calibration_id),
+        partial(service.store.last_event_of, calibration_id),
     )
     return await _stream(place, service.settings, calibration_id, followed, last_event_id)
 
@@ -243,7 +242,7 @@ async def follow_everything(
     ] = None,
 ) -> Response:
     """Follow all jobs, whatever their kind. `Last-Event-ID` comes before `after`."""
-    followed = followed_feed(service.feed, _BATCH)
+    followed = followed_feed(service.store, _BATCH)
     seen = after if last_event_id is None else last_event_id
     if seen is not None:
         return _opened(place, service.settings, EVERY_JOB, followed, seen)
@@ -251,22 +250,22 @@ async def follow_everything(
     return _opened(place, service.settings, EVERY_JOB, followed, now, begins=now)
 
 
-async def _follow_job(place: Place, service: Serving, jobs: JobStore, job_id: UUID, after: int) -> Response:
+async def _follow_job(place: Place, service: Serving, kind: JobKind, job_id: UUID, after: int) -> Response:
     # One that is on no record is refused here; one that is deleted later only ends its stream.
-    await run_in_threadpool(jobs.get, job_id)
-    return await _stream(place, service.settings, job_id, followed_job(jobs, job_id), after)
+    await run_in_threadpool(service.store.get, job_id, kind)
+    return await _stream(place, service.settings, job_id, followed_job(service.store, job_id), after)
 
 
-def followed_feed(feed: JobFeed, most: int) -> Followed:
+def followed_feed(jobs: JobStore, most: int) -> Followed:
     """All jobs as they are followed until the service ends, in looks for so many events."""
 
     def look(after: int) -> tuple[Sequence[JobEvent], bool]:
         # In this order: what ends the service has its last event among those found.
-        ended = feed.ended
-        found = feed.events(after=after, limit=most)
+        ended = jobs.ended
+        found = jobs.events_of_all(after=after, limit=most)
         return found, ended and len(found) < most
 
-    return Followed(look, feed.watch, feed.last, most)
+    return Followed(look, partial(jobs.watch, EVERY_JOB), jobs.last_event_of_all, most)
 
 
 def followed_job(jobs: JobStore, job_id: UUID) -> Followed:

@@ -62,7 +62,7 @@ def propose_exposures(
     preset = None if request.preset is None else service.presets.get(request.preset)
     asked = ScanRequest(**{key: getattr(request, key) for key in _SAME})
     plan = scan_plan(asked, service.scan_defaults, preset)
-    found = proposed_exposures(service.runner.queue, plan, budget_s=request.budget_s)
+    found = proposed_exposures(service.manager, plan, budget_s=request.budget_s)
     times_s = [each.exposure_s for each in found.exposures]
     exposing: dict[str, Any] = {"exposure_s": times_s[0]} if len(times_s) == 1 else {"exposures_s": times_s}
     same = request.model_dump(exclude_unset=True, include=set(_SAME))

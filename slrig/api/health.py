@@ -15,11 +15,15 @@ from slrig.api.openapi import file_of, problems
 from slrig.api.schemas import MOST_EXPOSURE_S, AnyFault, filled
 from slrig.api.service import Service, Serving
 from slrig.bundle import AwareMoment, Strict
+from slrig.calibrate.trend import health_svg
+from slrig.calibrate.verification import VerificationJob
 from slrig.calibration import Board
 from slrig.calibration.health import THRESHOLDS, DriftEstimate, HealthState, PairFigures, Thresholds
 from slrig.errors import CalibrationError
-from slrig.jobs.records import JobRecord, JobState, utc_now
-from slrig.verify.plot import health_svg
+from slrig.jobs.records import JobKind, JobRecord, JobState, utc_now
+
+MOST_VERIFICATIONS = 1000
+"""Verifications whose job stays on record. What they found is kept longer, by `RigHealth`."""
 
 router = APIRouter(prefix="/rig", tags=["health"])
 
@@ -91,7 +95,7 @@ class VerificationBody(BaseModel):
 @router.get("/health")
 def look_at_health(service: Serving) -> HealthBody:
     """Return whether the calibration in use still holds, why, and what to do. Touches no device."""
-    health, latest, calibration = service.verifications.health()
+    health, latest, calibration = service.health.health()
     solved = None if calibration is None else calibration.solved
     age_s = None if solved is None else (utc_now() - datetime.fromisoformat(solved.solved_at)).total_seconds()
     return filled(
@@ -113,7 +117,7 @@ def list_health(
     since: Annotated[AwareMoment | None, Query(description="ISO 8601, with its offset from UTC")] = None,
 ) -> HealthPage:
     """List verifications, newest first."""
-    found = service.verifications.store.history(limit=limit, since=since)
+    found = service.health.store.history(limit=limit, since=since)
     return HealthPage(verifications=[VerificationFigures.model_validate(record.document()) for record in found])
 
 
@@ -124,7 +128,7 @@ def list_health(
 )
 def plot_health(service: Serving, limit: Annotated[int, Query(ge=1, le=2000)] = 500) -> Response:
     """Draw the newest verifications over time."""
-    records = service.verifications.store.history(limit=limit)
+    records = service.health.store.history(limit=limit)
     return Response(health_svg(records[::-1]), media_type="image/svg+xml")
 
 
@@ -137,12 +141,14 @@ def verify_rig(
 ) -> VerificationBody:
     """Shoot the board and judge the calibration in use by it. The answer comes at once; look again later."""
     board = _board_in_use(service) if request.board is None else request.board.board()
-    desk, wait = service.verifications, request.if_busy == "queue"
 
     def start(key: str | None) -> UUID:
-        return desk.shoot(board, position=request.position, exposure_s=request.exposure_s, wait=wait, key=key).id
+        job = VerificationJob(board, request.position, request.exposure_s)
+        record = service.manager.submit(job, wait=request.if_busy == "queue", key=key)[0]
+        service.store.prune(JobKind.VERIFICATION, MOST_VERIFICATIONS)
+        return record.id
 
-    body = _body(started_once(service.keys, desk.jobs, idempotency_key, "/rig/verification", request, start))
+    body = _body(started_once(service.keys, service.store, idempotency_key, "/rig/verification", request, start))
     response.headers["Location"] = body.links["self"]
     return body
 
@@ -150,13 +156,13 @@ def verify_rig(
 @router.get("/verification/{verification_id}")
 def look_at_verification(service: Serving, verification_id: UUID) -> VerificationBody:
     """Return a verification: its state, and what was found, or why nothing was."""
-    return _body(service.verifications.jobs.get(verification_id))
+    return _body(service.store.get(verification_id, JobKind.VERIFICATION))
 
 
 @router.post("/verification/{verification_id}/cancel", status_code=202)
 def cancel_verification(service: Serving, verification_id: UUID) -> VerificationBody:
     """Ask a verification to end early. May be repeated."""
-    return _body(service.verifications.cancel(verification_id))
+    return _body(service.manager.cancel(service.store.get(verification_id, JobKind.VERIFICATION).id))
 
 
 def _board_in_use(service: Service) -> Board:

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from prometheus_client import CollectorRegistry, Histogram
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from slrig.jobs.records import JobEvent, JobRecord
-from slrig.jobs.timeline import stages_of
+from slrig.jobs.records import JobEvent, JobRecord, stages_of
 
 _ANSWER_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 """From what a kept-alive request takes on loopback, a millisecond, to where the records give up on a locked file."""

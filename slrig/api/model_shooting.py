@@ -14,8 +14,9 @@ from slrig.api.openapi import problems
 from slrig.api.schemas import ShotRequest, scan_plan
 from slrig.api.service import Serving
 from slrig.bundle import Strict
+from slrig.calibrate.verification import require_healthy
 from slrig.combine.plan import MOST_VIEWS, ShootPlan
-from slrig.verify.verification import require_healthy
+from slrig.jobs.records import JobKind
 
 router = APIRouter(prefix="/model", tags=["model"])
 
@@ -63,11 +64,11 @@ def shoot_model(
     plan = request.plan((), shoot=shoot)
 
     def start(key: str | None) -> UUID:
-        health, _, _ = service.verifications.health()
+        health, _, _ = service.health.health()
         require_healthy(health, refuse_when_stale=service.refuse_when_stale)
         return service.shooting.shoot(plan, label=request.label, wait=request.if_busy == "queue", key=key).id
 
-    record = started_once(service.keys, service.models.jobs, idempotency_key, "/model/shoot", request, start)
+    record = started_once(service.keys, service.store, idempotency_key, "/model/shoot", request, start)
     response.headers["Location"] = f"/model/{record.id}"
     return model_body(service, record)
 
@@ -86,7 +87,7 @@ def shoot_view(
         return service.shooting.shoot_view(model_id, again=request.again, wait=wait, key=key).id
 
     once(service.keys, idempotency_key, f"/model/{model_id}/view", request, start)
-    return model_body(service, service.models.jobs.get(model_id))
+    return model_body(service, service.store.get(model_id, JobKind.MODEL))
 
 
 @router.post("/{model_id}/combine", status_code=202, responses=problems(409, 507))

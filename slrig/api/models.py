@@ -28,7 +28,7 @@ from slrig.combine.plan import (
     TurntablePoses,
     UnknownPoses,
 )
-from slrig.jobs.records import JobRecord, JobState
+from slrig.jobs.records import JobKind, JobRecord, JobState
 
 router = APIRouter(prefix="/model", tags=["model"])
 
@@ -123,13 +123,13 @@ def start_model(
     service: Serving, response: Response, request: ModelRequest, idempotency_key: IdempotencyKey = None
 ) -> ModelBody:
     """Make one mesh of scans. It takes no rig, and the answer comes at once; follow `links.events` for the rest."""
-    desk = service.models
+    models = service.models
 
     def start(key: str | None) -> UUID:
         plan = request.plan(request.scans, angles_deg=request.angles_deg)
-        return desk.combine(plan, label=request.label, key=key).id
+        return models.combine(plan, label=request.label, key=key).id
 
-    record = started_once(service.keys, desk.jobs, idempotency_key, "/model", request, start)
+    record = started_once(service.keys, service.store, idempotency_key, "/model", request, start)
     response.headers["Location"] = f"/model/{record.id}"
     return model_body(service, record)
 
@@ -137,15 +137,19 @@ def start_model(
 @router.get("")
 def list_models(service: Serving, response: Response, cursor: Cursor = None, limit: PageLength = 50) -> ModelPage:
     """List models from new to old."""
-    jobs = service.models.jobs
-    shown, following = paged(lambda most: jobs.page(before=cursor, limit=most), limit, "/model", service, response)
+    store = service.store
+
+    def found(most: int) -> Sequence[JobRecord]:
+        return store.page(JobKind.MODEL, before=cursor, limit=most)
+
+    shown, following = paged(found, limit, "/model", service, response)
     return ModelPage(models=[model_body(service, record) for record in shown], next=following)
 
 
 @router.get("/{model_id}")
 def look_at_model(service: Serving, model_id: UUID) -> ModelBody:
     """Return a model: its state, how far it is, and where its files are."""
-    return model_body(service, service.models.jobs.get(model_id))
+    return model_body(service, service.store.get(model_id, JobKind.MODEL))
 
 
 @router.post("/{model_id}/cancel", status_code=202)
@@ -157,12 +161,13 @@ def cancel_model(service: Serving, model_id: UUID) -> ModelBody:
 @router.delete("/{model_id}", status_code=204, responses=problems(409, 507))
 def delete_model(service: Serving, model_id: UUID) -> None:
     """Delete a model that is over with all its files. Its scans stay."""
-    service.models.delete(model_id)
+    service.store.get(model_id, JobKind.MODEL)
+    service.manager.delete(model_id)
 
 
 def _serve(name: str, media_type: str) -> Callable[..., Response]:
     def fetch(service: Serving, model_id: UUID, known: KnownTag = None) -> Response:
-        record, path = service.models.jobs.get(model_id), service.models.store.place(model_id) / name
+        record, path = service.store.get(model_id, JobKind.MODEL), service.models.place(model_id) / name
         if record.state is not JobState.SUCCEEDED or not service.folder.owns(path):
             refuse_absent(record, name)
         return kept_file(path, media_type, model_id, known)
@@ -185,7 +190,7 @@ for _name, _media_type in MEDIA_TYPES.items():
 
 def model_body(service: Service, record: JobRecord) -> ModelBody:
     """A record as an answer."""
-    here, place = f"/model/{record.id}", service.models.store.place(record.id)
+    here, place = f"/model/{record.id}", service.models.place(record.id)
     ready = [name for name in MEDIA_TYPES if record.state is JobState.SUCCEEDED and service.folder.owns(place / name)]
     files = {name: f"{here}/{name}" for name in ready}
     links = JobLinks(self=here, events=f"{here}/events", cancel=f"{here}/cancel", files=files)

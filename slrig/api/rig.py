@@ -24,10 +24,10 @@ from slrig.devices import CameraInfo, FoundDevice
 from slrig.discovery import InstalledDriver, MissingLibrary, OtherSystem, discover_devices, installed_drivers
 from slrig.errors import SlrigError
 from slrig.jobs.examinations import Examination, last_examination
+from slrig.jobs.manager import RigStatus
 from slrig.jobs.records import utc_now
 from slrig.rig.preview import Light, Watch
 from slrig.rig.settings import SettingsInUse
-from slrig.scan.runner import RunnerStatus
 
 _BOUNDARY = "picture"
 _WIDEST_PX = 1280
@@ -54,8 +54,8 @@ _STREAM: dict[int | str, dict[str, Any]] = {
 @router.get("/rig")
 def look_at_rig(service: Serving) -> RigBody:
     """Return the rig: its devices, who holds it, and how many scans wait. Touches no device."""
-    status = service.runner.status()
-    facts, settings = status.facts, service.runner.queue.rig.settings
+    status = service.manager.status()
+    facts, settings = status.facts, service.manager.rig.settings
     return filled(
         RigBody,
         status,
@@ -101,7 +101,7 @@ class Examinations(BaseModel):
 @router.get("/rig/examinations")
 def list_examinations(service: Serving) -> Examinations:
     """Return what `slrig doctor` and `slrig conform` found last on this rig. Touches no device."""
-    root, rig = service.folder.root, service.runner.queue.rig.name
+    root, rig = service.folder.root, service.manager.rig.name
     return Examinations(
         doctor=last_examination(root, "doctor", rig),
         conform=last_examination(root, "conform", rig),
@@ -109,7 +109,7 @@ def list_examinations(service: Serving) -> Examinations:
     )
 
 
-def _in_use(status: RunnerStatus) -> CalibrationInUse | None:
+def _in_use(status: RigStatus) -> CalibrationInUse | None:
     active, facts = status.active, status.facts
     calibration = active.calibration if active is not None else None if facts is None else facts.calibration
     if calibration is None:
@@ -154,7 +154,7 @@ async def look_through_camera(
 ) -> Response:
     """Look through a camera while nobody scans: an `img` element shows it. A scan that comes goes first."""
     place.take()
-    watch = await run_in_threadpool(service.runner.queue.watch, camera, light)
+    watch = await run_in_threadpool(service.manager.watch, camera, light)
     return StreamingResponse(
         _parts(watch, marked=marks),
         media_type=f"multipart/x-mixed-replace; boundary={_BOUNDARY}",

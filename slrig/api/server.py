@@ -18,12 +18,16 @@ import uvicorn
 from starlette.concurrency import run_in_threadpool
 
 from slrig import KEY_VARIABLE
+from slrig.accept.job import PositionJob
 from slrig.api.app import create_app
 from slrig.api.connections import ConnectionConfig, Deadlines, listening_socket, quiet_accepts, room_for
 from slrig.api.keys import KeyRing, first_key
 from slrig.api.service import Service
 from slrig.api.sessions import LINK_PATH, Sessions
 from slrig.bundle import write_file
+from slrig.calibrate.jobs import PoseJob, SolveJob
+from slrig.calibrate.verification import VerificationJob
+from slrig.combine.job import TURNTABLE, ModelJob
 from slrig.compute.security import require_pool_extra
 from slrig.config import RigConfig, ServiceSettings, is_loopback
 from slrig.discovery import open_rig
@@ -32,17 +36,18 @@ from slrig.jobs.compute import Compute
 from slrig.jobs.copies import Copies
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
+from slrig.jobs.manager import JobManager
 from slrig.jobs.outbox import Outbox
-from slrig.jobs.records import JobKind, utc_now
+from slrig.jobs.records import utc_now
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import LOADING, READY, Worker, prepare_kernel_cache
 from slrig.logs import set_up_logs
 from slrig.rig.session import RigSession
-from slrig.scan.acquisition import capture_frames
-from slrig.scan.job import PIPELINE
-from slrig.scan.runner import Runner
-from slrig.scan.sweep import sweep
+from slrig.scan.job import PIPELINE, ScanJob
 from slrig.schedule.receivers import wanted_kinds
+
+KINDS = (ScanJob, VerificationJob, PoseJob, SolveJob, PositionJob, ModelJob)
+"""Every kind of job that a service runs."""
 
 ADDRESS_FILE = "service.json"
 """Where in the data folder a running service tells its URL and process id."""
@@ -73,53 +78,32 @@ def open_service(
         database = Database(folder.database)
         copies = None if settings.catalogue is None else Copies(database)
         outbox = Outbox(database, rig=rig.name, wanted=wanted_kinds(settings), copies=copies)
-        store = JobStore(database, JobKind.SCAN, outbox=outbox)
-        swept = sweep(store, folder)
-    except BaseException:
-        folder.release()
-        raise
-    for what, found in (
-        ("interrupted", swept.interrupted),
-        ("taken up again", swept.resumed),
-        ("recovered", swept.recovered),
-        ("without files", swept.lost),
-        ("put aside", swept.put_aside),
-    ):
-        for name in found:
-            _log.warning("left by the last run", scan=str(name), found=what)
-    try:
         worker = _worker(settings)
     except BaseException:
-        database.close()
         folder.release()
         raise
-    runner = Runner(
-        store,
-        folder,
-        RigSession(rig.name, lambda: open_rig(rig), table_at=folder.root / "turntable" / "table.json"),
-        worker,
-        capture=capture_frames,
-        queue_length=settings.queue_length,
-        backlog_length=settings.backlog_length,
-        spare_bytes=settings.min_free_bytes,
-        give_up=give_up,
-    )
     try:
-        runner.take_up(swept.resumed)
+        manager = JobManager(
+            JobStore(database, outbox=outbox),
+            folder,
+            RigSession(rig.name, lambda: open_rig(rig), table_at=folder.root / TURNTABLE / "table.json"),
+            worker,
+            *KINDS,
+            queue_length=settings.queue_length,
+            backlog_length=settings.backlog_length,
+            spare_bytes=settings.min_free_bytes,
+            give_up=give_up,
+        )
         return Service(
             settings,
             rig.scan,
-            folder,
-            store,
-            runner,
-            worker,
-            rig_name=rig.name,
+            manager,
             refuse_when_stale=rig.refuse_when_stale,
             tolerance_mm=rig.tolerance_mm,
             presets=rig.presets,
         )
     except BaseException:
-        store.database.close()
+        database.close()
         folder.release()
         raise
 
@@ -248,7 +232,7 @@ class _Server(uvicorn.Server):
 def _tell_preparation(service: Service, say: Callable[[str], None], ended: threading.Event) -> None:
     """Tell a person every few seconds how far the kernels are, the first time that they are compiled."""
     told = ""
-    while (status := service.runner.status()).preparing and not status.ending:
+    while (status := service.manager.status()).preparing and not status.ending:
         if status.reconstruction not in {told, LOADING}:
             told = status.reconstruction
             say(told)

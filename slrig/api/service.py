@@ -6,43 +6,38 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Annotated, TypeVar
+from uuid import UUID
 
 import structlog
 from fastapi import Depends, Query, Request, Response
 
-from slrig.accept.desk import AcceptanceDesk
+from slrig.accept.job import AcceptanceTests
 from slrig.api.latency import Durations
 from slrig.bundle import Preset, ScanDefaults
-from slrig.calibrate.calibrating import CalibrationSessions
+from slrig.calibrate.calibrating import Calibrations
 from slrig.calibrate.retention import Retention
-from slrig.calibrate.tools import CalibrationTools
-from slrig.calibrate.tools import calibration_tools as usual_calibration_tools
+from slrig.calibrate.verification import RigHealth
 from slrig.catalogue.copying import Copier
 from slrig.catalogue.standing import standing
 from slrig.catalogue.store import catalogue_of
-from slrig.combine.desk import CombineInto, ModelDesk
+from slrig.combine.job import TURNTABLE, Models
 from slrig.combine.shooting import ViewShooting
 from slrig.combine.turntable import TurntableStore
 from slrig.config import ServiceSettings
 from slrig.jobs.audit import Audit, AuditEntry
-from slrig.jobs.compute import Compute
-from slrig.jobs.data_folder import DataFolder
-from slrig.jobs.feed import JobFeed
 from slrig.jobs.keys import RequestKeys
+from slrig.jobs.manager import JobManager
 from slrig.jobs.records import JobKind, JobRecord, utc_now
-from slrig.jobs.store import JobStore
+from slrig.jobs.resume import resume
 from slrig.plugins import OBSERVERS, load
 from slrig.scan.presets import Presets
 from slrig.scan.retention import ScanLimits, ScanRetention
-from slrig.scan.runner import Runner
 from slrig.schedule.notices import NoticedHealth, tell_run
 from slrig.schedule.receivers import senders_of
 from slrig.schedule.records import ScheduledRun
 from slrig.schedule.scheduler import Scheduler
 from slrig.schedule.store import ScheduleStore
 from slrig.schedule.tasks import Tasks
-from slrig.verify.job import VerificationDesk
-from slrig.verify.verification import verification_tools
 
 _log = structlog.get_logger(__name__)
 
@@ -51,10 +46,9 @@ _SCHEDULE_END_S = 1.0
 
 
 class Service:
-    """One service: its settings, its data, the one that scans, those that calibrate, verify and test, and the schedule.
+    """One service: its settings, its jobs, what these belong to, and the schedule.
 
-    Until `start` nothing works. store : of scans; all jobs tell of their ends where those do. worker : the runner's,
-    which computes for all of them. refuse_when_stale : whether the rig file has scans refused then. tolerance_mm :
+    Until `start` nothing works. refuse_when_stale : whether the rig file has scans refused then. tolerance_mm :
     what it wants of a point's error. presets : the rig file's.
 
     Raises
@@ -72,116 +66,78 @@ class Service:
         self,
         settings: ServiceSettings,
         scan_defaults: ScanDefaults,
-        folder: DataFolder,
-        store: JobStore,
-        runner: Runner,
-        worker: Compute,
+        manager: JobManager,
         *,
-        rig_name: str,
-        calibration_tools: CalibrationTools | None = None,
-        combine: CombineInto | None = None,
         refuse_when_stale: bool = False,
         tolerance_mm: float | None = None,
         presets: Mapping[str, Preset] | None = None,
     ) -> None:
         self.settings = settings
         self.scan_defaults = scan_defaults
-        self.presets = Presets(folder.root / "presets", presets or {})
-        self.folder = folder
-        self.store = store
-        self.runner = runner
-        self.worker = worker
+        self.manager = manager
+        self.store, self.folder, self.worker = manager.store, manager.data, manager.worker
+        self.presets = Presets(self.folder.root / "presets", presets or {})
         self.refuse_when_stale = refuse_when_stale
         self.hurry = threading.Event()
-        database, outbox, spare_bytes = store.database, store.outbox, settings.min_free_bytes
+        database, outbox = self.store.database, self.store.outbox
         self.senders = senders_of(settings, outbox)
         self.keys = RequestKeys(database, life_s=settings.idempotency_keep_s)
         self.keys.release_all()
         self.audit = Audit(database)
-        self.calibrations = CalibrationSessions(
-            folder,
-            runner,
-            JobStore(database, JobKind.POSE, JobKind.SOLVE, outbox=outbox),
-            rig_name=rig_name,
-            tools=calibration_tools or usual_calibration_tools(worker),
-            spare_bytes=spare_bytes,
-            tolerance_mm=tolerance_mm,
-        )
-        self.verifications = VerificationDesk(
-            folder,
-            runner.queue,
-            NoticedHealth(database, outbox),
-            JobStore(database, JobKind.VERIFICATION, outbox=outbox),
-            tools=verification_tools(worker),
-            spare_bytes=spare_bytes,
-        )
-        runner.watch_health(self.verifications)
-        self.acceptance = AcceptanceDesk(
-            folder,
-            runner.queue,
-            JobStore(database, JobKind.POSITION, outbox=outbox),
-            evaluate=worker.task("slrig.accept.running:evaluated", "evaluation of the position"),
-            report=worker.task("slrig.accept.report:write_reports", "report of the acceptance test"),
-            tolerance_mm=tolerance_mm,
-        )
-        self.turntable = TurntableStore(folder.root / "turntable")
-        self.models = ModelDesk(
-            folder,
-            runner.queue,
-            JobStore(database, JobKind.MODEL, outbox=outbox),
-            scans=store,
-            combine=combine or worker.task("slrig.combine.combining:combine_into", "model"),
-            turntable=self.turntable,
-            keep=settings.keep_models,
-            spare_bytes=spare_bytes,
-        )
-        runner.spare_what_is_used(self.models.unused)
-        self.shooting = ViewShooting(self.models, runner, store)
-        self.find_axis = worker.task("slrig.calibrate.turntable_axis:axis_of_poses", "axis of the turntable")
-        self.find_planes = worker.task("slrig.combine.turntable_planes:planes_in", "planes of the turntable")
+        self.calibrations = Calibrations(manager, tolerance_mm=tolerance_mm)
+        self.health = RigHealth(manager.rig, NoticedHealth(database, outbox), self.folder)
+        manager.groups.update(dict.fromkeys((JobKind.SCAN, JobKind.VERIFICATION), self.health))
+        self.acceptance = AcceptanceTests(manager, tolerance_mm=tolerance_mm)
+        self.turntable = TurntableStore(self.folder.root / TURNTABLE)
+        spare_bytes = settings.min_free_bytes
+        self.models = Models(manager, turntable=self.turntable, keep=settings.keep_models, spare_bytes=spare_bytes)
+        self.shooting = ViewShooting(self.models, manager)
         self.durations = Durations()
         self.observers = [each for observe in load(OBSERVERS).values() if (each := observe()) is not None]
-        self._desks = (self.verifications, self.calibrations, self.acceptance, self.models)
-        stores = (
-            store,
-            self.calibrations.register.jobs,
-            *(each.jobs for each in (self.verifications, self.acceptance, self.models)),
-        )
-        self.feed = JobFeed(*stores)
-        for jobs in stores:
-            jobs.after_end = partial(self._ended, jobs)
-        for desk in (*self._desks, self.shooting):
-            desk.take_up()
+        self.calibrations.settle()
+        self.acceptance.settle()
+        resume(manager)
+        self.shooting.take_up()
+        self.models.remove_old()
+        self.store.after_end = self._ended
         self.retention = Retention(
             self.calibrations,
-            folder,
+            self.folder,
             keep=settings.keep_calibrations,
             named=lambda: {test.calibration for test in self.acceptance.latest()},
         )
         self.copier = self._copier()
         self._tellers = (*self.senders, *(() if self.copier is None else (self.copier,)))
         limits = ScanLimits(settings.keep_scans, settings.keep_scans_days, settings.keep_scans_bytes)
-        self.scan_retention = ScanRetention(store, folder, limits, runner.delete)
+        self.scan_retention = ScanRetention(self.store, self.folder, limits, self.delete_scan)
         self.schedules = ScheduleStore(database, notice=partial(tell_run, outbox))
-        self.tasks = Tasks(runner.queue, self.calibrations, self.verifications, self.acceptance, tidy=self.retention)
+        self.tasks = Tasks(manager, self.calibrations, self.acceptance, tidy=self.retention)
         # The folder's lock keeps every other process out.
         self.scheduler = Scheduler(self.schedules, self.tasks, alone=True)
+
+    def delete_scan(self, scan_id: UUID) -> None:
+        """Remove a finished scan: its record, its events, its files. Raises JobNotFoundError; ScanStateError: it is not
+        finished, or something that is under way uses it.
+        """
+        self.store.get(scan_id, JobKind.SCAN)
+        with self.models.unused(scan_id):
+            self.manager.delete(scan_id)
 
     def _copier(self) -> Copier | None:
         """What tells the catalogue of this rig, if the settings name one. Raises ConfigError, ExtraMissingError."""
         catalogue, copies = catalogue_of(self.settings), self.store.outbox.copies
         if catalogue is None or copies is None:
             return None
-        told = partial(standing, self.runner, self.verifications, data=self.folder.root.resolve(), started_at=utc_now())
+        told = partial(standing, self.manager, self.health, data=self.folder.root.resolve(), started_at=utc_now())
         return Copier(catalogue, copies, told)
 
-    def _ended(self, jobs: JobStore, record: JobRecord) -> None:
+    def _ended(self, record: JobRecord) -> None:
         """Measure a job that is over, and go on with the model of a view, and make room, after a scan."""
-        if jobs is self.store:
+        if record.kind is JobKind.SCAN:
             self.shooting.view_ended(record)
             self.scan_retention.look()
         try:
-            events = jobs.events(record.id, after=0)
+            events = self.store.events(record.id, after=0)
             self.durations.ended(record, events)
             for observer in self.observers:
                 observer.ended(record, events)
@@ -192,7 +148,7 @@ class Service:
         """Open the rig, look at the clock, send what waits, and remove what is old."""
         for sender in self._tellers:
             sender.start()
-        self.runner.start()
+        self.manager.start()
         self.scheduler.start()
         # It reads the report of every scan, and nobody waits for it.
         self.scan_retention.start()
@@ -202,18 +158,18 @@ class Service:
         """Begin nothing new, and let what has the rig come to its end, as long as the settings allow, or until
         `hurry`.
         """
-        self.runner.queue.drain(self.settings.drain_s, self.hurry)
+        self.manager.drain(self.settings.drain_s, self.hurry)
 
     def end_work(self) -> None:
         """Stop scanning and calibrating, and record what was cut off. Idempotent."""
         self.scan_retention.close()
+        self.scheduler.stop()
+        self.tasks.end()
         self.scheduler.close(timeout_s=min(_SCHEDULE_END_S, self.settings.shutdown_s))
-        self.runner.close(timeout_s=self.settings.shutdown_s)
+        self.manager.close(timeout_s=self.settings.shutdown_s)
         # A run that held a deaf driver has its answer now.
         self.scheduler.close(timeout_s=_SCHEDULE_END_S)
-        for desk in self._desks:
-            desk.close()
-        self.feed.end()
+        self.store.end()
 
     def close(self) -> None:
         """Stop scanning, then let records and data folder go. Idempotent."""

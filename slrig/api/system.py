@@ -20,8 +20,8 @@ from slrig.api.schemas import Explanation, Probe
 from slrig.api.service import Probed, Service, Serving
 from slrig.calibration.health import HealthState
 from slrig.errors import StorageError
-from slrig.jobs.records import JobState, utc_now
-from slrig.scan.runner import RunnerStatus
+from slrig.jobs.manager import RigStatus
+from slrig.jobs.records import JobKind, JobState, utc_now
 from slrig.schedule.records import RunState, TaskKind
 
 router = APIRouter(tags=["system"])
@@ -51,12 +51,12 @@ class _Figures(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """See `prometheus_client.registry.Collector`."""
-        states = Counter(self._service.store.states().values())
+        states = Counter(self._service.store.states(JobKind.SCAN).values())
         scans = GaugeMetricFamily("slrig_scans", "Scans on record, by state.", labels=["state"])
         for state in JobState:
             scans.add_metric([state], states[state])
         yield scans
-        status = self._service.runner.status()
+        status = self._service.manager.status()
         is_open = status.facts is not None and status.fault is None
         yield GaugeMetricFamily("slrig_rig_open", "1 while the rig is open and well.", float(is_open))
         is_held = status.holder is not None
@@ -68,7 +68,7 @@ class _Figures(Collector):
         yield from self._catalogue()
 
     def _calibration(self) -> Iterator[Metric]:
-        health, latest, calibration = self._service.verifications.health()
+        health, latest, calibration = self._service.health.health()
         states = GaugeMetricFamily("slrig_rig_health", "1 for the state of the rig's health.", labels=["state"])
         for state in HealthState:
             states.add_metric([state], float(health.state is state))
@@ -143,7 +143,7 @@ def readyz(service: Probed) -> Response | Probe:
     A rig that is held is well. `pending` names what is not ready yet and gets there by itself: the rig while it is
     opened, the reconstruction until its process has loaded its kernels, which the first time takes a minute.
     """
-    status = service.runner.status()
+    status = service.manager.status()
     checks = {
         "records": _storage(service.store.check),
         "disk": _storage(lambda: service.folder.require_space(service.settings.min_free_bytes)),
@@ -177,7 +177,7 @@ def _storage(check: Callable[[], None]) -> str:
     return "ok"
 
 
-def _rig(status: RunnerStatus) -> str:
+def _rig(status: RigStatus) -> str:
     if status.ending:
         return "the service is ending"
     if status.fault is not None:

@@ -14,11 +14,15 @@ from pydantic import BaseModel, Field
 from slrig.api.openapi import file_of, problems
 from slrig.api.service import Serving
 from slrig.bundle import AxisSource, Strict, TurntableEntry, TurntableRecord, turntable_entry, turntable_record
-from slrig.calibrate.tools import setting_of
+from slrig.calibrate.jobs import turntable_axis
+from slrig.calibrate.records import setting_of
+from slrig.calibrate.store import session_readings
+from slrig.combine.job import turntable_planes
 from slrig.combine.turntable import TurntableState, state_of
 from slrig.combine.turntable_plot import turntable_svg
 from slrig.errors import CalibrationStateError, ConfigError, ScanStateError
-from slrig.jobs.records import JobState
+from slrig.jobs.records import JobKind, JobState
+from slrig.jobs.worker_process import Task
 from slrig.scan.artefacts import MESH
 
 router = APIRouter(prefix="/rig", tags=["turntable"])
@@ -88,12 +92,13 @@ def plot_turntable(service: Serving) -> Response:
 def calibrate_turntable(service: Serving, request: Annotated[AxisRequest, Body()]) -> AxisBody:
     """Calibrate the axis from poses of a board that stood on the turntable, by the calibration in use."""
     record = service.calibrations.register.get(request.calibration)
-    board, (_, _, calibration) = setting_of(record).board, service.verifications.health()
+    board, (_, _, calibration) = setting_of(record).board, service.health.health()
     if calibration is None:
         message = "The rig has no calibration in use, by which poses of a board tell an axis. Activate one first."
         raise CalibrationStateError(message)
     numbers_of = [pose.number for pose in record.accepted]
-    accepted = dict(zip(numbers_of, service.calibrations.store.readings(record), strict=True))
+    readings = session_readings(service.calibrations.store.folder(record.id))
+    accepted = dict(zip(numbers_of, readings, strict=True))
     numbers = numbers_of if request.poses is None else request.poses
     missing = [str(number) for number in numbers if number not in accepted]
     if missing or len(set(numbers)) < len(numbers):
@@ -103,7 +108,8 @@ def calibrate_turntable(service: Serving, request: Annotated[AxisRequest, Body()
         message = f"angles_deg: expected one for each of {len(numbers)} poses, found {len(request.angles_deg)}"
         raise ConfigError(message)
     observed = [accepted[number].observation for number in numbers]
-    found = service.find_axis(observed, board, calibration, request.angles_deg)
+    given = (observed, board, calibration, request.angles_deg)
+    found = service.worker.run(Task(turntable_axis, given, what="axis of the turntable"))
     turntable = service.turntable.put_axis(found.axis.measured_axis, source=AxisSource.BOARD, of=str(record.id))
     poses = [
         TurntablePose(
@@ -117,13 +123,14 @@ def calibrate_turntable(service: Serving, request: Annotated[AxisRequest, Body()
 @router.post("/turntable/planes", responses=problems(404, 409, 503, 507))
 def find_planes(service: Serving, request: Annotated[PlanesRequest, Body()]) -> TurntableBody:
     """Find plate and backdrops in a scan of the empty turntable. Views of models are cut by them from then on."""
-    scan, mesh = service.store.get(request.scan), service.folder.scan(request.scan) / MESH
+    scan, mesh = service.store.get(request.scan, JobKind.SCAN), service.folder.scan(request.scan) / MESH
     if scan.state is not JobState.SUCCEEDED or not service.folder.owns(mesh):
         message = (
             f"Scan {request.scan} is {scan.state} and has no {MESH} here. Scan the empty turntable, and wait for it."
         )
         raise ScanStateError(message)
-    return _body(service.turntable.put_planes(service.find_planes(mesh, service.turntable.axis())))
+    found = service.worker.run(Task(turntable_planes, (mesh, service.turntable.axis()), what="planes of the turntable"))
+    return _body(service.turntable.put_planes(found))
 
 
 @router.put("/turntable", responses=problems(507))

@@ -2,37 +2,56 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from uuid import UUID, uuid4
 
 import structlog
 
-from slrig.bundle import write_calibration, write_durably, write_opencv_calibration
-from slrig.calibrate.pose_shooting import PoseDesk, outcome_of
-from slrig.calibrate.records import USUAL_PATTERNS, SessionRecord, SessionState
+from slrig.bundle import (
+    check_calibration,
+    read_calibration,
+    write_calibration,
+    write_durably,
+    write_opencv_calibration,
+)
+from slrig.calibrate.jobs import (
+    PoseJob,
+    SolveJob,
+    compare,
+    coverage_picture,
+    require_same_devices,
+    session_devices,
+    survey,
+    warm,
+)
+from slrig.calibrate.records import USUAL_PATTERNS, PoseRecord, SessionRecord, SessionState, setting_of
 from slrig.calibrate.register import CalibrationRegister
-from slrig.calibrate.solves import SolveDesk
-from slrig.calibrate.store import CALIBRATION, READING, ActivePointer, CalibrationStore
-from slrig.calibrate.tools import CalibrationTools, setting_of
-from slrig.calibration import Board
+from slrig.calibrate.store import CALIBRATION, COMPARED, ActivePointer, CalibrationStore
+from slrig.calibration import Board, BoardShape
 from slrig.calibration.accuracy import Comparison
 from slrig.errors import (
     ArtefactNotReadyError,
     CalibrationError,
     CalibrationStateError,
     CameraNotFoundError,
-    StorageError,
+    SlrigError,
+    SolveRefusedError,
+    UnsupportedByDeviceError,
 )
-from slrig.failure import disk_errors, job_failure
-from slrig.jobs.data_folder import DataFolder
-from slrig.jobs.records import JobKind, JobRecord, JobState
-from slrig.jobs.rig_jobs import RigJobs
-from slrig.jobs.store import JobStore
+from slrig.failure import disk_errors
+from slrig.jobs.job import Job, Outcome
+from slrig.jobs.manager import JobManager
+from slrig.jobs.records import Holder, JobKind, utc_now
+from slrig.jobs.worker_process import Task
 from slrig.model import Calibration
-from slrig.rig.session import ActiveCalibration
+from slrig.rig.session import ActiveCalibration, RigFacts
 from slrig.scan.plan import PatternPlan
-from slrig.scan.runner import Runner
 
 EXPORTS = ("calibration.json", "calibration.yml", "calibration.xml")
 """The forms in which a calibration can be had, and taken in."""
@@ -40,105 +59,267 @@ EXPORTS = ("calibration.json", "calibration.yml", "calibration.xml")
 _log = structlog.get_logger(__name__)
 
 
-class CalibrationSessions:
-    """The calibrations of a data folder, and the work on them. Any thread may call; `close` at the end.
+@dataclass(frozen=True, slots=True)
+class PoseRequest:
+    """A pose that is asked for. position : index or name of a pose of the positioner; None leaves the board where it
+    is.
+    """
 
-    jobs : those of poses and solves. `poses` shoots, `solves` solves, `register` has the records.
+    position: int | str | None = None
+    exposure_s: float | None = None
+
+
+class Calibrations:
+    """The calibrations of a data folder, and the work on them: the `Group` of poses and solves. Any thread may call.
+
+    register : the sessions on record. tolerance_mm : what the rig file says that a point of a scan may be wrong by.
 
     Raises StorageError if the folder cannot be read, or the active calibration is gone.
     """
 
-    def __init__(
-        self,
-        folder: DataFolder,
-        runner: Runner,
-        jobs: JobStore,
-        *,
-        rig_name: str,
-        tools: CalibrationTools,
-        spare_bytes: int = 0,
-        tolerance_mm: float | None = None,
-    ) -> None:
-        self._data = folder
-        self.store = CalibrationStore(folder)
-        self.register = CalibrationRegister(self.store, jobs)
-        self._work = RigJobs(jobs, runner.queue, folder)
-        self._runner = runner
-        self._rig_name = rig_name
-        self._tools = tools
-        self.poses = PoseDesk(self.register, folder, self._work, tools, spare_bytes)
-        self.solves = SolveDesk(self.register, self._work, tools, tolerance_mm, self._of_the_rig)
-        runner.use_calibration(self.store.active_calibration())
+    def __init__(self, manager: JobManager, *, tolerance_mm: float | None = None) -> None:
+        self.store = CalibrationStore(manager.data)
+        self.register = CalibrationRegister(self.store, manager.store)
+        self._manager = manager
+        self._tolerance_mm = tolerance_mm
+        self._last_frame_s: dict[UUID, float] = {}
+        manager.groups.update(dict.fromkeys((JobKind.POSE, JobKind.SOLVE), self))
+        manager.rig.use_calibration(self.store.active_calibration())
 
-    def _of_the_rig(self) -> Calibration | None:
-        facts = self._runner.queue.rig.facts
-        return None if facts is None else facts.calibration
-
-    def take_up(self) -> None:
-        """Settle what the last run of the service left open, or have it go on. Before the rig is used.
-
-        - A pose that waited is shot; one whose frames are there is read; one that has its answer gets it; one that had
-          the rig, and a solve, was interrupted. See `PoseDesk.take_up`, `SolveDesk.take_up`.
-        - A pose that was accepted and has no files is recorded as failed.
-        - A pose in its place without a record, as beside a database that was lost, is on record again, as it says
-          itself.
-        - Jobs of a calibration that is gone are forgotten.
-        """
-        records = self.register.all()
-        by_session = self.register.jobs.of()
-        for session_id in by_session.keys() - {record.id for record in records}:
-            self.register.jobs.delete_of(session_id)
-        for record in records:
-            jobs = by_session.get(record.id, [])
-            for job in jobs:
-                if job.kind is JobKind.POSE:
-                    self._settle_pose(record.id, job)
-                elif not job.state.final:
-                    self.solves.take_up(record.id, job)
-            known = {job.plan["number"] for job in jobs if job.kind is JobKind.POSE}
-            for number in self.store.pose_numbers(record.id):
-                if number not in known:
-                    self._restore_pose(record, number)
-
-    def _settle_pose(self, session_id: UUID, job: JobRecord) -> None:
-        number = job.plan["number"]
-        place, answer = self.store.pose(session_id, number), self.store.answer(session_id, number)
-        if job.state.final:
-            if job.state is JobState.SUCCEEDED and not (place / READING).is_file():
-                message = f"The files of pose {number} are gone from {place}. Shoot it again."
-                self.register.jobs.lose_files(job.id, job_failure(StorageError(message)))
-        elif answer is None:
-            self.poses.take_up(session_id, job)
-        else:
-            outcome = outcome_of(answer)
-            state = JobState.SUCCEEDED if outcome.fault is None else JobState.FAILED
-            self.register.jobs.finish(job.id, state, fault=outcome.fault, summary=outcome.summary)
-
-    def _restore_pose(self, record: SessionRecord, number: int) -> None:
-        """Put a pose on record again, or remove what is none."""
-        answer = self.store.answer(record.id, number)
-        if answer is None:
-            self.store.discard_pose(record.id, number)
-            return
-        outcome = outcome_of(answer)
-        self.register.jobs.restore(
-            uuid4(),
-            answer["pose"],
-            outcome.summary or {},
-            rig=record.rig,
-            label=None,
-            created_at=record.created_at,
-            started_at=record.created_at,
-            fault=outcome.fault,
-            parent=record.id,
-        )
-        _log.warning("left by the last run", calibration=str(record.id), pose=number, found="recovered")
+    def settle(self) -> None:
+        """Forget jobs of calibrations that are gone. At the start, before jobs are gone on with."""
+        known = {record.id for record in self.register.all()}
+        for session_id in self._manager.store.by_parent(JobKind.POSE, JobKind.SOLVE).keys() - known:
+            self._manager.store.delete_of(session_id)
 
     def open(self, board: Board, *, label: str | None = None, patterns: PatternPlan = USUAL_PATTERNS) -> SessionRecord:
         """Open a session for a board. Touches no device. Raises StorageError."""
-        record = self.register.add(uuid4(), self._rig_name, label, board=board, patterns=patterns)
-        self.poses.warm()
+        record = self.register.add(uuid4(), self._manager.rig.name, label, board=board, patterns=patterns)
+
+        def load() -> None:
+            try:
+                self._manager.worker.run(Task(warm, what="preparation"))
+            except Exception:  # noqa: BLE001 - the first pose will tell
+                _log.exception("what reads poses cannot be loaded")
+
+        threading.Thread(target=load, name="slrig-warm", daemon=True).start()
         return record
+
+    # Poses
+
+    def shoot(
+        self,
+        session_id: UUID,
+        request: PoseRequest,
+        *,
+        wait: bool,
+        key: str | None = None,
+        holder: Holder | None = None,
+    ) -> PoseRecord:
+        """Have a pose shot; `wait` lets it stand in line. Returns at once.
+
+        key : the idempotency key of the request, reserved. holder : whom a refusal names meanwhile; None the pose.
+
+        Raises
+        ------
+        CalibrationNotFoundError, CalibrationStateError
+            There is no such session, or it is being solved, or was imported.
+        UnsupportedByDeviceError
+            The rig has no positioner, or not that position, or a camera cannot expose so long.
+        CalibrationError
+            The rig is not the one of the session's other poses.
+        RigBusyError, QueueFullError, DeviceError, StorageError
+            As a scan.
+        """
+        with self.register.lock:
+            record = self.register.get(session_id)
+            setting_of(record)
+            if record.state is SessionState.SOLVING:
+                message = f"Calibration {record.id} is being solved. Shoot the next pose when that is over."
+                raise CalibrationStateError(message)
+            facts = self._manager.rig.facts
+            place, name = _position(request.position, facts)
+            if facts is not None:
+                require_same_devices(record, *session_devices(record, facts))
+            number = record.latest_pose + 1
+            self._manager.submit(
+                PoseJob(session_id, number, place, name, request.exposure_s, record.patterns),
+                wait=wait, key=key, holder=holder,
+                first=lambda: self.register.change(session_id, latest_pose=number),
+            )  # fmt: skip
+            return self.register.pose(session_id, number)
+
+    def script(
+        self,
+        session_id: UUID,
+        positions: Sequence[int | str],
+        request: PoseRequest,
+        *,
+        wait: bool,
+        key: str | None = None,
+        holder: Holder | None = None,
+    ) -> PoseRecord:
+        """Have poses of the positioner shot one after the other, and return the first; none means all of them.
+
+        Other work may come between two of them. A pose that fails or is cancelled ends the script; one that is refused
+        does not. Raises as `shoot` does.
+        """
+        with self.register.lock:
+            facts = self._manager.rig.facts
+            # Of a rig without positions, the first is asked for, and refused.
+            asked = positions or range(max(len(facts.positions) if facts is not None else 0, 1))
+            first, *others = [place for each in asked if (place := _position(each, facts)[0]) is not None]
+            exposed = PoseRequest(first, request.exposure_s)
+            pose = self.shoot(session_id, exposed, wait=wait, key=key, holder=holder)
+            self._set_script(session_id, *others)
+            return pose
+
+    def cancel(self, session_id: UUID, number: int) -> PoseRecord:
+        """Ask a pose to end early, and the script that it belongs to. Returns at once; a pose that is over stays so."""
+        pose = self.register.pose(session_id, number)
+        if not pose.state.final:
+            self._set_script(session_id)
+            self._manager.cancel(pose.id)
+        return self.register.pose(session_id, number)
+
+    def drop(self, session_id: UUID, number: int) -> None:
+        """Forget a pose and remove its files. Raises CalibrationStateError while it is under way."""
+        with self.register.lock:
+            pose = self.register.pose(session_id, number)
+            solving = self.register.get(session_id).state is SessionState.SOLVING
+            if not pose.state.final or solving:
+                what = "The calibration is being solved" if pose.state.final else f"Pose {number} is {pose.state}"
+                message = f"{what}. Wait until that is over, then drop the pose."
+                raise CalibrationStateError(message)
+            if pose.accepted:
+                self.register.change(session_id, state=SessionState.OPEN)
+            self.store.discard_pose(session_id, number)
+            self._manager.store.delete(pose.id)
+        try:
+            if self.register.get(session_id).cameras:
+                guidance = self._manager.worker.run(
+                    Task(survey, (self.store.folder(session_id),), what="survey of the poses")
+                )
+                self.register.change(session_id, must_last=False, **guidance)
+        except Exception:  # noqa: BLE001 - coverage and advice are a help, and nothing fails for want of them
+            _log.exception("coverage could not be told", calibration=str(session_id))
+
+    # The solve
+
+    def solve(self, session_id: UUID, *, board_shape: BoardShape = BoardShape.AUTO) -> SessionRecord:
+        """Begin to solve a session from its accepted poses. Returns at once.
+
+        board_shape : whether the board may be bowed.
+
+        Raises
+        ------
+        CalibrationNotFoundError
+            There is no such session.
+        CalibrationStateError
+            It is being solved, a pose of it is under way, or it was imported.
+        SolveRefusedError
+            It has no accepted pose.
+        StorageError
+            The disk refused.
+        """
+        with self.register.lock:
+            record = self.register.get(session_id)
+            setting_of(record)
+            if record.state is SessionState.SOLVING:
+                message = (
+                    f"Calibration {session_id} is being solved already. Follow it with GET /calibration/{session_id}."
+                )
+                raise CalibrationStateError(message)
+            pending = [pose.name for pose in record.poses if not pose.state.final]
+            if pending:
+                message = f"{', '.join(pending)} is still under way. Solve when it has its answer."
+                raise CalibrationStateError(message)
+            if not record.accepted:
+                message = (
+                    f"Calibration {session_id} has no accepted pose. Shoot some first "
+                    f"(POST /calibration/{session_id}/pose); GET /calibration/{session_id} tells what to shoot."
+                )
+                raise SolveRefusedError(message)
+            compared, used = self.store.folder(session_id) / COMPARED, self._comparable(record)
+            with disk_errors(compared):
+                compared.unlink(missing_ok=True)
+            if used is not None:
+                write_calibration(compared, used)
+            self._manager.submit(SolveJob(session_id, record.solve + 1, board_shape, self._tolerance_mm))
+            return self.register.get(session_id)
+
+    def _comparable(self, record: SessionRecord) -> Calibration | None:
+        """The calibration in use, if it is one of the same devices."""
+        used = self._manager.rig.calibration
+        if used is None or record.projector is None:
+            return None
+        try:
+            check_calibration(used, record.projector, record.cameras, "the calibration in use")
+        except CalibrationError:
+            return None
+        return used
+
+    # What becomes of jobs
+
+    def captured(self, job: Job, job_id: UUID) -> None:
+        """See `Group`: the next pose of a script is shot, exposed like the one before."""
+        if not isinstance(job, PoseJob):
+            return
+        self._last_frame_s[job_id] = time.monotonic()
+        facts = self._manager.rig.facts
+        with self.register.lock:
+            record = self.register.get(job.group)
+            if not record.cameras and facts is not None:
+                cameras, projector = session_devices(record, facts)
+                self.register.change(job.group, must_last=False, cameras=cameras, projector=projector)
+            if not record.script:
+                return
+            self._set_script(job.group, *record.script[1:])
+            try:
+                self.shoot(job.group, PoseRequest(record.script[0], job.exposure_s), wait=True)
+            except SlrigError as error:
+                _log.warning("the script of poses ends", calibration=str(job.group), cause=str(error))
+                self._set_script(job.group)
+
+    def ended(self, job: Job, job_id: UUID, outcome: Outcome | None) -> Outcome:
+        """See `Group`."""
+        if isinstance(job, SolveJob):
+            return self._solved(job, outcome)
+        if not isinstance(job, PoseJob):
+            raise TypeError(job)
+        since_s = self._last_frame_s.pop(job_id, None)
+        if outcome is None or outcome.summary is None:
+            self._set_script(job.group)
+            self.store.discard_pose(job.group, job.number)
+            return Outcome()
+        summary = dict(outcome.summary)
+        noted: dict[str, Any] = summary.pop("guidance") or {}
+        if outcome.fault is None:
+            # A solved session is open again; the earlier result stays.
+            noted = {**noted, "state": SessionState.OPEN}
+        self.register.change(job.group, must_last=False, **noted)
+        seconds = None if since_s is None else round(time.monotonic() - since_s, 3)
+        refused = outcome.fault is not None
+        _log.info("pose read", calibration=str(job.group), pose=job.number, refused=refused, seconds=seconds)
+        return Outcome({**summary, "seconds": seconds}, outcome.fault)
+
+    def _solved(self, job: SolveJob, outcome: Outcome | None) -> Outcome:
+        with suppress(OSError):
+            (self.store.folder(job.group) / COMPARED).unlink(missing_ok=True)
+        if outcome is None or outcome.summary is None:
+            self.register.change(job.group, must_last=False, state=SessionState.FAILED)
+            return Outcome()
+        self.register.change(
+            job.group, state=SessionState.SOLVED, solve=job.number, solved_at=utc_now(),
+            result=outcome.summary["result"],
+        )  # fmt: skip
+        _log.info("calibration solved", calibration=str(job.group), solve=job.number)
+        return Outcome({"solve": job.number})
+
+    def _set_script(self, session_id: UUID, *left: int) -> None:
+        self.register.change(session_id, must_last=False, script=left)
+
+    # What is kept
 
     def submit(self, text: bytes, ending: str, *, label: str | None = None) -> SessionRecord:
         """Make a calibration of a file's text: ours, or OpenCV's. `ending` is that of one of `EXPORTS`.
@@ -152,7 +333,8 @@ class CalibrationSessions:
             with disk_errors(staged):
                 write_durably(source, text)
             try:
-                calibration = self._tools.parse(source)
+                task = Task(read_calibration, (source,), what="reading of the calibration")
+                calibration: Calibration = self._manager.worker.run(task)
             except CalibrationError as error:
                 message = str(error).replace(str(source), "the calibration sent")
                 raise CalibrationError(message) from error
@@ -161,7 +343,7 @@ class CalibrationSessions:
             cameras = {name: device.size for name, device in calibration.cameras.items()}
             projector = None if calibration.projector is None else calibration.projector.size
             with self.register.lock:
-                self.register.add(session_id, self._rig_name, label, cameras=cameras, projector=projector)
+                self.register.add(session_id, self._manager.rig.name, label, cameras=cameras, projector=projector)
                 try:
                     self.store.commit_solve(session_id, 1, staged)
                     self.register.change(session_id, state=SessionState.SOLVED, solve=1)
@@ -180,11 +362,11 @@ class CalibrationSessions:
         """
         with self.register.lock:
             record = self.register.get(session_id)
-            self._runner.use_calibration(ActiveCalibration(str(session_id), self.calibration(session_id)))
+            self._manager.rig.use_calibration(ActiveCalibration(str(session_id), self.calibration(session_id)))
             try:
                 self.store.activate(ActivePointer(session_id, record.solve))
             except BaseException:
-                self._runner.use_calibration(self.store.active_calibration())
+                self._manager.rig.use_calibration(self.store.active_calibration())
                 raise
         _log.info("calibration activated", calibration=str(session_id), solve=record.solve)
         return record
@@ -197,7 +379,7 @@ class CalibrationSessions:
                 message = f"Calibration {session_id} is not in use."
                 raise CalibrationStateError(message)
             self.store.activate(None)
-            self._runner.use_calibration(None)
+            self._manager.rig.use_calibration(None)
         return record
 
     @property
@@ -244,7 +426,7 @@ class CalibrationSessions:
         """Return where a file of the last solve lies. Raises CalibrationNotFoundError, ArtefactNotReadyError."""
         record = self.register.get(session_id)
         path = self.store.solve(session_id, record.solve) / name
-        if not record.solve or not self._data.owns(path):
+        if not record.solve or not self._manager.data.owns(path):
             what = "was imported, and" if record.board is None else "has no solve yet that went well, and"
             message = f"Calibration {session_id} {what} has no {name}."
             raise ArtefactNotReadyError(message)
@@ -278,16 +460,34 @@ class CalibrationSessions:
         if chosen not in names:
             message = f"Calibration {session_id} has no device '{chosen}'; it has {', '.join(names)}."
             raise CameraNotFoundError(message)
-        return self._tools.coverage_picture(setting, chosen, self.store.readings(record), record.next_move or {})
+        given = (self.store.folder(session_id), chosen, record.next_move or {})
+        picture: bytes = self._manager.worker.run(Task(coverage_picture, given, what="picture of the coverage"))
+        return picture
 
     def compare(self, first: UUID, second: UUID) -> Comparison:
         """Return what the second says otherwise than the first. Raises as `calibration` does."""
-        return self._tools.compare(self.calibration(first), self.calibration(second))
+        given = (self.calibration(first), self.calibration(second))
+        found: Comparison = self._manager.worker.run(Task(compare, given, what="comparison"))
+        return found
 
     def latest(self) -> Sequence[SessionRecord]:
         """Return all calibrations, newest first."""
         return self.register.all()
 
-    def close(self) -> None:
-        """Put on record what the disk refused before. Idempotent; after the rig's runner has been closed."""
-        self._work.close()
+
+def _position(asked: int | str | None, facts: RigFacts | None) -> tuple[int | None, str | None]:
+    """The index and the name of a position. Raises UnsupportedByDeviceError."""
+    if asked is None:
+        return None, None
+    names = () if facts is None else facts.positions
+    if not names:
+        message = (
+            "position: this rig has no positioner, or is not open yet; hold the board yourself and leave position out"
+        )
+        raise UnsupportedByDeviceError(message)
+    if isinstance(asked, str) and asked in names:
+        return names.index(asked), asked
+    if isinstance(asked, int) and 0 <= asked < len(names):
+        return asked, names[asked]
+    message = f"position: found {asked!r}, this rig has 0 to {len(names) - 1}: {', '.join(names)}"
+    raise UnsupportedByDeviceError(message)

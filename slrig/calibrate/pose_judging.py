@@ -4,19 +4,38 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
 from slrig.bundle import write_file
 from slrig.calibrate.figures import baselines, device_figures
 from slrig.calibrate.pose_pictures import white_frame
-from slrig.calibrate.records import SessionRecord, plain
+from slrig.calibrate.records import SessionRecord, Setting, plain
 from slrig.calibrate.report import report_html
 from slrig.calibrate.solving import CalibrationResult, ReadPose
-from slrig.calibrate.tools import Judgement, SessionGuidance, Setting
 from slrig.calibration.judgement import describe_board
 from slrig.calibration.poses import Advice, Coverage, advise_pose, check_pose, coverage, estimate_rig
+
+
+@dataclass(frozen=True, slots=True)
+class SessionGuidance:
+    """Where a session stands: what its poses cover, and what to move next and why; JSON values."""
+
+    coverage: Mapping[str, Any]
+    next_move: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What is told of a pose. refusals : why it cannot be used, in words; none if it can. answer : its figures, as JSON
+    values. standing : where the session stands with it, None where it could not be read.
+    """
+
+    refusals: tuple[str, ...]
+    answer: Mapping[str, Any]
+    standing: SessionGuidance | None
+
 
 _ANSWER = (
     "warnings",

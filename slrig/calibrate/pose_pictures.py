@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.bundle import read_description, read_pages
+from slrig.calibrate.records import Setting
 from slrig.calibrate.solving import ReadPose
-from slrig.calibrate.tools import Setting
 from slrig.calibration import PROJECTOR, Board, PoseObservation
 from slrig.calibration.poses import coverage, draw_coverage, draw_pose, projector_view
 from slrig.errors import BundleError

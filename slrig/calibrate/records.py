@@ -12,8 +12,8 @@ from uuid import UUID
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
-from slrig.calibration import Board
-from slrig.errors import InvalidInputError, PoseRefusedError, StorageError
+from slrig.calibration import PROJECTOR, Board
+from slrig.errors import CalibrationStateError, InvalidInputError, PoseRefusedError, StorageError
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState
 from slrig.model import SequenceName, Size
@@ -62,12 +62,6 @@ class PoseRecord:
         return f"pose {self.number}"
 
     @property
-    def plan(self) -> dict[str, Any]:
-        """That of its job."""
-        names = ("number", "position", "position_name", "exposure_s")
-        return {name: getattr(self, name) for name in names}
-
-    @property
     def accepted(self) -> bool:
         """Whether a solve takes it."""
         return self.state is JobState.SUCCEEDED
@@ -88,7 +82,7 @@ def pose_of(job: JobRecord) -> PoseRecord:
         answer=found.get("answer"),
         fault=job.fault,
         seconds=found.get("seconds"),
-        **job.plan,
+        **{name: job.plan[name] for name in ("number", "position", "position_name", "exposure_s")},
     )
 
 
@@ -131,6 +125,28 @@ class SessionRecord:
     def accepted(self) -> tuple[PoseRecord, ...]:
         """The poses that a solve takes."""
         return tuple(pose for pose in self.poses if pose.accepted)
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """The board before the rig, and the extents of the devices; projector is None where only cameras are calibrated."""
+
+    board: Board
+    cameras: Mapping[str, Size]
+    projector: Size | None
+
+    @property
+    def sizes(self) -> Mapping[str, Size]:
+        """The extents of the devices, the projector among them where there is one."""
+        return self.cameras if self.projector is None else {**self.cameras, PROJECTOR: self.projector}
+
+
+def setting_of(record: SessionRecord) -> Setting:
+    """The setting of a session. Raises CalibrationStateError for an imported calibration, which has no board."""
+    if record.board is None:
+        message = f"Calibration {record.id} was imported and has no board. Open a new one to shoot poses."
+        raise CalibrationStateError(message)
+    return Setting(record.board, record.cameras, record.projector)
 
 
 def with_jobs(session: SessionRecord, jobs: Sequence[JobRecord]) -> SessionRecord:

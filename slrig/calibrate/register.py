@@ -13,7 +13,7 @@ import structlog
 from slrig.calibrate.records import PoseRecord, SessionRecord, with_jobs
 from slrig.calibrate.store import CalibrationStore
 from slrig.errors import CalibrationNotFoundError, StorageError
-from slrig.jobs.records import utc_now
+from slrig.jobs.records import JobKind, utc_now
 from slrig.jobs.store import JobStore
 
 _log = structlog.get_logger(__name__)
@@ -36,13 +36,13 @@ class CalibrationRegister:
         """Return every calibration, newest first."""
         with self.lock:
             sessions = sorted(self._sessions.values(), key=lambda session: session.number, reverse=True)
-            jobs = self.jobs.of()
+            jobs = self.jobs.by_parent(JobKind.POSE, JobKind.SOLVE)
         return [with_jobs(session, jobs.get(session.id, ())) for session in sessions]
 
     def get(self, session_id: UUID) -> SessionRecord:
         """Return a calibration. Raises CalibrationNotFoundError."""
         with self.lock:
-            return with_jobs(self._session(session_id), self.jobs.of(session_id).get(session_id, ()))
+            return with_jobs(self._session(session_id), self.jobs.of(session_id))
 
     def pose(self, session_id: UUID, number: int) -> PoseRecord:
         """Return a pose. Raises CalibrationNotFoundError."""

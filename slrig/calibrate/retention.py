@@ -16,7 +16,7 @@ from uuid import UUID
 import structlog
 
 from slrig.bundle import read_calibration
-from slrig.calibrate.calibrating import CalibrationSessions
+from slrig.calibrate.calibrating import Calibrations
 from slrig.calibrate.records import SessionRecord
 from slrig.errors import CalibrationError, CalibrationNotFoundError, CalibrationStateError, StorageError
 from slrig.jobs.data_folder import DataFolder
@@ -31,7 +31,7 @@ class Retention:
     keep : so many are kept whatever they are. named : further names of calibrations that are needed.
     """
 
-    calibrations: CalibrationSessions
+    calibrations: Calibrations
     folder: DataFolder
     keep: int
     named: Callable[[], set[str]] = set

@@ -17,7 +17,7 @@ import shutil
 import uuid
 import zipfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 from uuid import UUID
@@ -25,12 +25,13 @@ from uuid import UUID
 import numpy as np
 
 from slrig.bundle import read_calibration, sync_folder, sync_tree, write_durably, write_file
-from slrig.calibrate.records import SessionRecord, session_from_json, session_json
+from slrig.calibrate.records import SessionRecord, pose_of, session_from_json, session_json
 from slrig.calibrate.solving import ReadPose
 from slrig.calibration import BoardView, Correspondences, PoseObservation, ViewQuality
 from slrig.errors import CalibrationError, StorageError
 from slrig.failure import disk_errors
 from slrig.jobs.data_folder import BUNDLE, DataFolder
+from slrig.jobs.records import read_record
 from slrig.model import Calibration
 from slrig.rig.session import ActiveCalibration
 
@@ -39,6 +40,8 @@ CALIBRATION = "calibration.json"
 REPORT = "report.html"
 ANSWER = "answer.json"
 READING = "reading.npz"
+COMPARED = "compared.json"
+"""The calibration that a solve of the session is compared with."""
 
 _ACTIVE_FORMAT = "slrig-active-calibration"
 
@@ -112,30 +115,9 @@ class CalibrationStore:
         """Remove a calibration with all its files: by one rename out of place first."""
         self._remove(self.folder(session_id))
 
-    def commit_pose(self, session_id: UUID, number: int, staged: Path) -> None:
-        """Move a pose into place, whole and durable. Its bundle is durable already."""
-        self._commit(staged, self.pose(session_id, number))
-
     def discard_pose(self, session_id: UUID, number: int) -> None:
         """Remove a pose. Idempotent."""
         self._remove(self.pose(session_id, number))
-
-    def pose_numbers(self, session_id: UUID) -> list[int]:
-        """The numbers of the poses that are in place."""
-        places = (self.folder(session_id) / "poses").iterdir()
-        return sorted(int(place.name) for place in places if place.name.isdigit() and not place.is_symlink())
-
-    def answer(self, session_id: UUID, number: int) -> dict[str, Any] | None:
-        """What the pose in place says of itself; None where it cannot be read."""
-        try:
-            found = json.loads((self.pose(session_id, number) / ANSWER).read_bytes())
-            return found if isinstance(found, dict) else None
-        except (OSError, ValueError):
-            return None
-
-    def readings(self, record: SessionRecord) -> list[ReadPose]:
-        """What was read of a session's accepted poses, so that the frames need not be. Raises StorageError."""
-        return [_read_reading(self.pose(record.id, pose.number) / READING) for pose in record.accepted]
 
     def stage_solve(self, session_id: UUID) -> Path:
         """Make a folder for the results of a solve."""
@@ -222,6 +204,23 @@ class CalibrationStore:
         with disk_errors(place):
             place.rename(gone)
         self.discard(gone)
+
+
+def read_session(folder: Path) -> SessionRecord:
+    """A session as its folder has it. Raises StorageError."""
+    with disk_errors(folder):
+        return session_from_json((folder / SESSION).read_bytes(), str(folder / SESSION))
+
+
+def session_readings(folder: Path) -> list[ReadPose]:
+    """What was read of the accepted poses of a session, by their numbers. Raises StorageError."""
+    return [_read_reading(place) for place in sorted((folder / "poses").glob(f"*/{READING}"))]
+
+
+def with_poses_on_disk(session: SessionRecord, folder: Path) -> SessionRecord:
+    """A session with the poses in its folder, each as it was judged there."""
+    jobs = [read_record(place) for place in sorted((folder / "poses").iterdir())]
+    return replace(session, poses=tuple(pose_of(job) for job in jobs if job is not None))
 
 
 _READ_PARTS: dict[str, type[Any]] = {"view": BoardView, "light": Correspondences, "figures": ViewQuality}

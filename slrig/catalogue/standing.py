@@ -8,15 +8,15 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from slrig.calibrate.verification import RigHealth
+from slrig.jobs.manager import JobManager, RigStatus
 from slrig.jobs.worker import READY
-from slrig.scan.runner import Runner, RunnerStatus
-from slrig.verify.job import VerificationDesk
 
 
-def standing(runner: Runner, verifications: VerificationDesk, *, data: Path, started_at: datetime) -> dict[str, Any]:
+def standing(manager: JobManager, health_of: RigHealth, *, data: Path, started_at: datetime) -> dict[str, Any]:
     """The columns of a rig's row, but for when it is seen and what is not copied. data : the service's folder."""
-    status = runner.status()
-    health, latest, _ = verifications.health()
+    status = manager.status()
+    health, latest, _ = health_of.health()
     state, words = _state(status)
     return {
         "name": status.rig,
@@ -34,7 +34,7 @@ def standing(runner: Runner, verifications: VerificationDesk, *, data: Path, sta
     }
 
 
-def _state(status: RunnerStatus) -> tuple[str, str]:
+def _state(status: RigStatus) -> tuple[str, str]:
     """What a rig is at, and in words."""
     if status.fault is not None:
         return "fault", status.fault

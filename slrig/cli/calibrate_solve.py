@@ -25,8 +25,8 @@ from slrig.logs import set_up_console_logs
 from slrig.model import Size
 
 if TYPE_CHECKING:
+    from slrig.calibrate.records import Setting
     from slrig.calibrate.solving import CalibrationResult, ReadPose
-    from slrig.calibrate.tools import Setting
 
 DESCRIPTION = "bundle.json"
 ENDINGS = (".json", ".yml", ".yaml", ".xml")
@@ -104,8 +104,8 @@ def _solved(
         display("loading", 0.0, "")
         # numba and its kernels: a second or two, and many the first time.
         from slrig.calibrate.pose_judging import summary
+        from slrig.calibrate.records import Setting
         from slrig.calibrate.solving import solve_poses
-        from slrig.calibrate.tools import Setting
 
         found = Readings()
         cameras = _one_rig(bundles, found)

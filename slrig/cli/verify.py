@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from slrig.bundle import read_calibration
 from slrig.calibrate.records import USUAL_PATTERNS
+from slrig.calibrate.verification import verify_bundle
 from slrig.calibration import Board
 from slrig.calibration.health import Health, HealthState, Verification, judge_health
 from slrig.cli.display import print_json, progress_shown
@@ -21,7 +22,6 @@ from slrig.logs import set_up_console_logs
 from slrig.model import Calibration
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ProgressCallback, ScanPlan
-from slrig.verify.verification import verify_bundle
 
 _COLOURS = {HealthState.GOOD: "green", HealthState.WATCH: "yellow", HealthState.STALE: "bold red"}
 

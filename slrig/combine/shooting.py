@@ -14,7 +14,7 @@ from uuid import UUID, uuid4
 
 import structlog
 
-from slrig.combine.desk import SHOOTING_SHARE, ModelDesk
+from slrig.combine.job import SHOOTING_SHARE, ModelJob, Models
 from slrig.combine.plan import (
     GivenPoses,
     MarkerPoses,
@@ -23,7 +23,6 @@ from slrig.combine.plan import (
     TurntablePoses,
     UnknownPoses,
     plan_from_json,
-    plan_json,
 )
 from slrig.errors import (
     DeviceError,
@@ -37,10 +36,10 @@ from slrig.errors import (
     ViewsFailedError,
 )
 from slrig.failure import errors_by_code, job_failure
-from slrig.jobs.records import JobProgress, JobRecord, JobState, acting_as, utc_now
-from slrig.jobs.store import JobStore
+from slrig.jobs.manager import JobManager
+from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, acting_as, utc_now
+from slrig.scan.job import ScanJob
 from slrig.scan.records import plan_from_json as scan_plan_from_json
-from slrig.scan.runner import Runner
 
 MOST_AGAIN = 2
 """How often a view is shot again by itself: what a device does three times it will do once more."""
@@ -103,18 +102,18 @@ def views_of(shoot: ShootPlan, scans: Sequence[JobRecord]) -> tuple[View, ...]:
 
 
 class ViewShooting:
-    """Shoots models. Any thread may call. scans : those on record; `view_ended` has to be told of the end of each."""
+    """Shoots models. Any thread may call; `view_ended` has to be called with each scan that is over."""
 
-    def __init__(self, desk: ModelDesk, runner: Runner, scans: JobStore) -> None:
-        self._desk = desk
-        self._runner = runner
-        self._scans = scans
+    def __init__(self, models: Models, manager: JobManager) -> None:
+        self._models = models
+        self._manager = manager
+        self._jobs = manager.store
         # Held while it is decided what comes next; the end of a scan may be told within.
         self._deciding = threading.RLock()
 
     def take_up(self) -> None:
         """Go on with the models that an earlier run of the service was shooting; once its scans are taken up."""
-        for record in self._desk.jobs.unfinished():
+        for record in self._jobs.unfinished(JobKind.MODEL):
             if plan_from_json(record.plan).being_shot:
                 self._watch(record.id)
                 try:
@@ -122,10 +121,10 @@ class ViewShooting:
                 except Exception:  # noqa: BLE001 - the others, and the service, go on all the same
                     _log.exception("a model could not be gone on with", model=str(record.id))
         # A cancellation that was cut off is completed.
-        models = self._desk.jobs.states()
-        for scan in self._scans.unfinished():
+        models = self._jobs.states(JobKind.MODEL)
+        for scan in self._jobs.unfinished(JobKind.SCAN):
             if scan.parent is not None and models.get(scan.parent) is JobState.CANCELLED:
-                self._runner.cancel(scan.id)
+                self._manager.cancel(scan.id)
 
     def shoot(self, plan: ModelPlan, *, label: str | None, wait: bool, key: str | None = None) -> JobRecord:
         """Have the views of a model shot, and the model made of them. Returns at once.
@@ -143,25 +142,25 @@ class ViewShooting:
             As a scan.
         """
         shoot = _shoot_plan(plan)
-        plan = self._desk.with_axis(plan)
+        plan = self._models.with_axis(plan)
         model_id, numbers = uuid4(), range(1, 2 if shoot.manual else shoot.views + 1)
 
         def begun() -> None:
-            jobs, rig = self._desk.jobs, self._runner.queue.rig.name
-            jobs.create(plan_json(plan), rig=rig, label=label, key=key, job_id=model_id)
+            self._manager.record(ModelJob(plan), label=label, key=key, job_id=model_id)
 
-        views = [shoot.view(number, model_id, utc_now()) for number in numbers]
+        views = [ScanJob(shoot.view(number, model_id, utc_now())) for number in numbers]
+        self._require_space(views)
         with self._deciding:
             try:
-                self._runner.submit_views(views, model_id, label=label, wait=wait, begun=begun)
+                self._manager.submit(*views, label=label, wait=wait, first=begun)
             except StorageError as error:
                 # Its scans could not be put on record: it is not to wait for them.
                 with suppress(JobNotFoundError, StorageError):
-                    self._desk.jobs.finish(model_id, JobState.FAILED, fault=job_failure(error))
+                    self._jobs.finish(model_id, JobState.FAILED, fault=job_failure(error))
                 raise
             self._tell(model_id, shoot)
         self._watch(model_id)
-        return self._desk.jobs.get(model_id)
+        return self._jobs.get(model_id, JobKind.MODEL)
 
     def shoot_view(self, model_id: UUID, *, again: bool, wait: bool, key: str | None = None) -> JobRecord:
         """Have the next view of a model shot, whose object was turned by hand; or the last one once more, in place of
@@ -187,9 +186,9 @@ class ViewShooting:
                 )
                 raise ScanStateError(message)
             plan = shoot.view(number, model_id, utc_now())
-            self._runner.submit_views([plan], model_id, label=record.label, wait=wait, key=key)
+            self._manager.submit(ScanJob(plan), label=record.label, wait=wait, key=key)
             self._tell(model_id, shoot)
-            return self._desk.jobs.get(model_id)
+            return self._jobs.get(model_id, JobKind.MODEL)
 
     def combine(self, model_id: UUID) -> JobRecord:
         """Have a model made of the views that there are. Returns it at once.
@@ -208,23 +207,23 @@ class ViewShooting:
                 message = f"Model {model_id} has {good} good views of {shoot.views}; it takes two. Shoot another first."
                 raise ScanStateError(message)
             self._combine(record, shoot, views)
-            return self._desk.jobs.get(model_id)
+            return self._jobs.get(model_id, JobKind.MODEL)
 
     def cancel(self, model_id: UUID) -> JobRecord:
         """Ask a model to end early, and with it those of its scans that are not over. Returns at once; one that is over
         stays so. Raises JobNotFoundError.
         """
         with self._deciding:
-            record = self._desk.jobs.get(model_id)
+            record = self._jobs.get(model_id, JobKind.MODEL)
             if not plan_from_json(record.plan).being_shot:
-                return self._desk.cancel(model_id)
+                return self._manager.cancel(model_id)
             fault = job_failure(ScanCancelledError("The model was cancelled while its views were shot. They stay."))
-            self._desk.jobs.finish(model_id, JobState.CANCELLED, fault=fault)
+            self._jobs.finish(model_id, JobState.CANCELLED, fault=fault)
             # Also of one that was cancelled before, and not wholly. The last first: no other one begins meanwhile.
-            for scan in reversed(self._scans.of(model_id).get(model_id, [])):
+            for scan in reversed(self._jobs.of(model_id)):
                 if not scan.state.final:
-                    self._runner.cancel(scan.id)
-            return self._desk.jobs.get(model_id)
+                    self._manager.cancel(scan.id)
+            return self._jobs.get(model_id, JobKind.MODEL)
 
     def view_ended(self, scan: JobRecord) -> None:
         """Go on with the model that a scan is a view of, if it is one. Raises nothing; see `JobStore.after_end`."""
@@ -239,12 +238,12 @@ class ViewShooting:
         """Do what comes next, whatever was done before: shoot what is missing, tell a person, or make the model."""
         with self._deciding:
             try:
-                record = self._desk.jobs.get(model_id)
+                record = self._jobs.get(model_id, JobKind.MODEL)
             except JobNotFoundError:
                 # Of a series of scans, or of a model that was deleted.
                 return
             plan = plan_from_json(record.plan)
-            if record.state.final or not plan.being_shot or self._runner.queue.ending:
+            if record.state.final or not plan.being_shot or self._manager.ending:
                 return
             shoot = _shoot_plan(plan)
             views = self._views(model_id, shoot)
@@ -258,9 +257,9 @@ class ViewShooting:
                 missing = [view for view in _of_another_zero(plan, views) if len(view.scans) <= MOST_AGAIN]
             if missing:
                 _log.info("views are put in line", model=str(model_id), views=[view.number for view in missing])
-                plans = [shoot.view(view.number, model_id, utc_now()) for view in missing]
+                jobs = [ScanJob(shoot.view(view.number, model_id, utc_now())) for view in missing]
                 with acting_as(record.requested_by):
-                    self._runner.add_views(plans, model_id, label=record.label)
+                    self._manager.add(*jobs, label=record.label)
             elif shoot.manual and not (views[-1].ended and views[-1].good is views[-1].scans[-1]):
                 pass  # A person turns, or decides what becomes of a last view that failed.
             elif all(view.ended or shoot.manual for view in views):
@@ -291,14 +290,18 @@ class ViewShooting:
                     f"The scans stay: GET /scan/series/{record.id}. Put right what failed, and shoot again."
                 )
                 raise ViewsFailedError(message)
-            self._desk.begin(record, replace(plan, scans=tuple(good.values()), poses=poses, notes=left_out))
+            self._models.begin(record, replace(plan, scans=tuple(good.values()), poses=poses, notes=left_out))
         except SlrigError as error:
             _log.warning("a model failed", model=str(record.id), cause=str(error))
-            self._desk.jobs.finish(record.id, JobState.FAILED, fault=job_failure(error))
+            self._jobs.finish(record.id, JobState.FAILED, fault=job_failure(error))
+
+    def _require_space(self, views: Sequence[ScanJob]) -> None:
+        """Raise StorageError unless there is room for all views."""
+        self._manager.data.require_space(sum(view.check(self._manager.rig) for view in views))
 
     def _waiting(self, model_id: UUID) -> tuple[JobRecord, ShootPlan, tuple[View, ...]]:
         """A model that waits for a hand. Raises JobNotFoundError, ScanStateError."""
-        record = self._desk.jobs.get(model_id)
+        record = self._jobs.get(model_id, JobKind.MODEL)
         plan = plan_from_json(record.plan)
         if record.state.final or not plan.being_shot or plan.shoot is None or not plan.shoot.manual:
             how = "is not shot by hand" if plan.shoot is None or not plan.shoot.manual else f"is {record.state}"
@@ -314,7 +317,7 @@ class ViewShooting:
         return record, plan.shoot, views
 
     def _views(self, model_id: UUID, shoot: ShootPlan) -> tuple[View, ...]:
-        return views_of(shoot, self._scans.of(model_id).get(model_id, []))
+        return views_of(shoot, self._jobs.of(model_id))
 
     def _tell(self, model_id: UUID, shoot: ShootPlan) -> None:
         """Put on record how far it is, and for a person what to do."""
@@ -333,7 +336,7 @@ class ViewShooting:
             if last.good is None:
                 detail = f"view {last.number} failed, and may be shot again: {last.why} Or {detail}"
         try:
-            self._desk.jobs.progress(model_id, JobProgress(stage, SHOOTING_SHARE * done / shoot.views, detail))
+            self._jobs.progress(model_id, JobProgress(stage, SHOOTING_SHARE * done / shoot.views, detail))
         except StorageError as error:
             _log.warning("how far a model is could not be recorded", model=str(model_id), cause=str(error))
 
@@ -352,14 +355,14 @@ class ViewShooting:
                 self._deciding.release()
 
         def look_at_states() -> None:
-            begun = any(scan.state is not JobState.QUEUED for scan in self._scans.of(model_id).get(model_id, []))
+            begun = any(scan.state is not JobState.QUEUED for scan in self._jobs.of(model_id))
             if begun and watching:
                 watching.pop()()
-                if self._desk.jobs.states().get(model_id) is JobState.QUEUED:
-                    self._desk.jobs.advance(model_id, JobState.CAPTURING)
+                if self._jobs.states(JobKind.MODEL).get(model_id) is JobState.QUEUED:
+                    self._jobs.advance(model_id, JobState.CAPTURING)
 
         watching: list[Callable[[], None]] = []
-        watching.append(self._scans.watch(model_id, look))
+        watching.append(self._jobs.watch(model_id, look))
         look()
 
 

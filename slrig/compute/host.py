@@ -20,6 +20,8 @@ from slrig.compute.store import PoolError, PoolStore
 from slrig.errors import ScanCancelledError, WorkerLostError
 from slrig.failure import JobFailure, job_failure
 from slrig.jobs.compute import Compute
+from slrig.jobs.data_folder import BUNDLE, RESULT
+from slrig.jobs.versions import versions
 from slrig.jobs.worker_process import Task
 
 BEAT_S = 2.0
@@ -33,14 +35,14 @@ POOL_FAULT = "pool"
 
 Tell = Callable[[Mapping[str, Any]], None]
 
-_VERSIONS = Task("slrig.jobs.versions:versions", what="statement of versions")
+_VERSIONS = Task(versions, what="statement of versions")
 
 _log = structlog.get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class PoolRequest:
-    """A task for a pool. bundle : its key in the store. task : `given` lacks the two folders, see `Task.movable`.
+    """A task for a pool. bundle : its key in the store. task : its files are the rig's, see `Task.movable`.
     topic : of dask's events, where its progress is told. versions : of the rig; others must not compute it.
     """
 
@@ -132,23 +134,22 @@ class Host(WorkerPlugin):
                 told = detail.replace(f"{scratch}/", "")
                 tell({"job": order.job, "stage": stage, "fraction": fraction, "detail": told})
 
-            bundle, result = Path(scratch) / "bundle", Path(scratch) / "result"
-            result.mkdir()
+            bundle, result = Path(scratch) / BUNDLE, Path(scratch) / RESULT
             self._store.fetch_bundle(order.bundle, bundle, beat)
-            given = (bundle, result, *order.task.given)
-            task = replace(order.task, given=given, where={"where": "pool"}, remedy="Its rig computes by itself.")
+            files = None if order.task.files is None else replace(order.task.files, folder=Path(scratch), place=None)
+            task = replace(order.task, files=files, where={"where": "pool"}, remedy="Its rig computes by itself.")
             # While the next file is made, the last one travels.
-            line, files = ThreadPoolExecutor(1, thread_name_prefix="slrig-store"), dict[str, Future[str]]()
+            line, sent = ThreadPoolExecutor(1, thread_name_prefix="slrig-store"), dict[str, Future[str]]()
 
             def made(name: str) -> None:
-                files[name] = line.submit(self._store.put_result, order.job, result / name, beat)
+                sent[name] = line.submit(self._store.put_result, order.job, result / name, beat)
 
             try:
                 answer = self._worker.run(task, progress=progress, cancelled=stopped, made=made)
                 for path in result.iterdir():
-                    if path.name not in files:
+                    if path.name not in sent:
                         made(path.name)
-                return PoolResponse(answer, {name: files[name].result() for name in sorted(files)})
+                return PoolResponse(answer, {name: sent[name].result() for name in sorted(sent)})
             finally:
                 line.shutdown(cancel_futures=True)
 

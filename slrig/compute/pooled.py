@@ -24,8 +24,10 @@ from slrig.compute.host import POOL_FAULT, PoolRequest, PoolResponse
 from slrig.compute.security import pool_security
 from slrig.compute.store import PoolError, PoolStore, open_store
 from slrig.config import ServiceSettings
+from slrig.disk import storage_errors
 from slrig.errors import ConfigError, ScanCancelledError, StorageError
 from slrig.jobs.compute import Compute
+from slrig.jobs.data_folder import BUNDLE, RESULT
 from slrig.jobs.frame_feed import FrameFeed
 from slrig.jobs.versions import versions
 from slrig.jobs.worker import Worker
@@ -66,7 +68,6 @@ class PooledWorker:
         self._closed = False
         # Nobody waits for the store to be tidied.
         self._tidying = ThreadPoolExecutor(1, thread_name_prefix="slrig-store")
-        self.module, self.task = local.module, local.task
 
     @property
     def condition(self) -> str:
@@ -124,9 +125,11 @@ class PooledWorker:
     def _by_pool(self, task: Task, progress: Told, cancelled: Callable[[], bool], made: Made) -> Any:
         if not self._cluster.usable():
             raise PoolError(self._cluster.fault)
-        bundle: Path = task.given[0]
-        result: Path = task.given[1]
-        key = None
+        if task.files is None:
+            raise PoolError("the task has no bundle")
+        bundle, result, key = task.files.folder / BUNDLE, task.files.folder / RESULT, None
+        with storage_errors(result):
+            result.mkdir(exist_ok=True)
         try:
             for left in reversed(range(TRIES)):
                 try:
@@ -145,7 +148,7 @@ class PooledWorker:
         self, task: Task, key: str, result: Path, progress: Told, cancelled: Callable[[], bool], made: Made
     ) -> Any:
         job = uuid4().hex
-        order = PoolRequest(job, key, replace(task, given=task.given[2:]), self._cluster.topic, versions())
+        order = PoolRequest(job, key, task, self._cluster.topic, versions())
         told: SimpleQueue[Mapping[str, Any]] = SimpleQueue()
         coming, answer = self._cluster.submit(order, told.put), None
         try:

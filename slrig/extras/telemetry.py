@@ -13,8 +13,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING
 
 from slrig.errors import ConfigError
-from slrig.jobs.records import JobEvent, JobRecord, JobState
-from slrig.jobs.timeline import stages_of
+from slrig.jobs.records import JobEvent, JobRecord, JobState, stages_of
 
 if TYPE_CHECKING:
     from opentelemetry.sdk.trace import TracerProvider

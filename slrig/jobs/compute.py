@@ -8,18 +8,20 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from slrig.jobs.frame_feed import FrameFeed
-from slrig.jobs.worker_process import Task
+from slrig.jobs.job import Job, JobRun
+from slrig.jobs.worker_process import JobFiles, Task
 from slrig.jobs.worker_wait import Made, Told
 from slrig.model import Region
 
 
-class Compute(Protocol):
-    """Does named tasks for the service. Any thread may call. `slrig.jobs.worker.Worker` says what each part does."""
+def job_task(job: Job, run: JobRun) -> Task:
+    """The second part of a job as a task."""
+    files = JobFiles(run.id, run.folder, run.place, run.evidence)
+    return Task(job.compute, (), files, what=job.noun, remedy=job.remedy, movable=job.movable)
 
-    @property
-    def module(self) -> str:
-        """What the reconstruction is: a module with `reconstruct_into`."""
-        ...
+
+class Compute(Protocol):
+    """Does tasks for the service. Any thread may call. `slrig.jobs.worker.Worker` says what each part does."""
 
     @property
     def condition(self) -> str:
@@ -50,10 +52,6 @@ class Compute(Protocol):
         within_s: float | None = None,
     ) -> Any:
         """Do a task, and return its result."""
-        ...
-
-    def task(self, function: str, what: str) -> Callable[..., Any]:
-        """A function that is done by `run`, "module:function"."""
         ...
 
     def close(self) -> None:

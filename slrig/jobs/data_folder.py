@@ -6,7 +6,7 @@ DATA/slrig.sqlite    the records
 DATA/scans/ID/       a finished scan: bundle/, mesh.ply, report.json ...
 DATA/calibrations/   calibrations and their sessions: see `slrig.calibrate.store`
 DATA/acceptance/     acceptance tests: see `slrig.accept.store`
-DATA/models/         models of several scans: see `slrig.combine.store`
+DATA/models/         models of several scans: see `slrig.combine.job`
 DATA/presets/NAME.json  presets that were put: see `slrig.scan.presets`
 DATA/doctor.json     what `slrig doctor` found last, and conform.json: see `slrig.jobs.examinations`
 DATA/.incoming/ID/   a scan, a pose, a solve or a model being made; swept at the next start
@@ -18,9 +18,9 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from uuid import UUID
+from uuid import UUID, uuid4
 
 import structlog
 from filelock import FileLock, Timeout
@@ -31,12 +31,12 @@ from slrig.failure import disk_errors
 
 DATABASE, SCANS, ORPHANS, BUNDLE = "slrig.sqlite", "scans", ".orphans", "bundle"
 
-_HOLDER, _RESULT = "holder", "result"
+RESULT = "result"
+"""Below the folder of a job: files that can be fetched before it is over."""
+
+_HOLDER = "holder"
 
 _log = structlog.get_logger(__name__)
-
-_PROMISED = ("mesh.ply", "report.json")
-"""What every scan has that succeeded."""
 
 
 def free_bytes(folder: Path) -> int:
@@ -196,10 +196,10 @@ class DataFolder:
 
     def result(self, scan_id: UUID) -> Path:
         """Where the files of a scan that is being reconstructed lie, once each is there."""
-        return self.staging(scan_id) / _RESULT
+        return self.staging(scan_id) / RESULT
 
     def places(self, scan_id: UUID) -> tuple[Path, Path, Path]:
-        """Where a file of a scan that is being reconstructed may lie. `commit` moves it from one to the next: whoever
+        """Where a file of a scan that is being reconstructed may lie. `put` moves it from one to the next: whoever
         looks in this order finds it.
         """
         return self.result(scan_id), self.staging(scan_id), self.scan(scan_id)
@@ -215,45 +215,51 @@ class DataFolder:
             folder.mkdir()
         return folder
 
-    def stage_result(self, scan_id: UUID) -> Path:
-        """Make the folder, in that of a staged scan, in which its reconstruction puts one whole file after another."""
-        folder = self.result(scan_id)
-        with disk_errors(folder):
-            folder.mkdir()
-        return folder
+    def put(self, job_id: UUID, place: Path) -> None:
+        """Move what is staged for a job to its place, by one rename, durable: all but a bundle, which is so already.
 
-    def commit(self, scan_id: UUID) -> None:
-        """Move a staged scan to its place, whole and durable: fsync all but the bundle, which is so already, then one
-        rename. The reconstruction's own folder is dissolved, so that its files lie beside the bundle.
+        What could be fetched before lies beside the bundle then. What lies there of an attempt that was cut off before
+        its end was on record is removed.
         """
-        staged = self.staging(scan_id)
+        staged = self.staging(job_id)
         with disk_errors(staged):
-            result = self.result(scan_id)
+            result = self.result(job_id)
             if result.is_dir():
                 for file in sorted(result.iterdir()):
                     file.rename(staged / file.name)
                 result.rmdir()
-        self.put(scan_id, self.scan(scan_id))
-
-    def put(self, job_id: UUID, place: Path) -> None:
-        """Move what is staged for a job to its place, by one rename, durable: all but a bundle, which is so already."""
-        staged = self.staging(job_id)
-        with disk_errors(staged):
             sync_tree(staged, except_folder=BUNDLE)
+            self.remove(place)
             staged.rename(place)
             sync_folder(place.parent)
             sync_folder(self.incoming)
 
-    def keep_bundle(self, scan_id: UUID) -> None:
-        """Commit the bundle of a scan that got no mesh, whole or cut short, and nothing else of it. Does nothing where
-        none was recorded.
-        """
-        if self.recording(scan_id).is_dir():
-            self.keep_recording(scan_id)
-        if not (self.staging(scan_id) / BUNDLE).is_dir():
+    def remove(self, place: Path) -> None:
+        """Remove files by one rename out of their place first. Idempotent. Raises StorageError."""
+        if not os.path.lexists(place):
             return
-        self.clear_results(scan_id)
-        self.commit(scan_id)
+        gone = self.incoming / f"gone-{uuid4().hex}"
+        with disk_errors(place):
+            place.rename(gone)
+        shutil.rmtree(gone, ignore_errors=True)
+
+    def put_aside(self, place: Path) -> None:
+        """Move files that no record knows to `orphans`."""
+        self.orphans.mkdir(exist_ok=True)
+        above = place.parent.relative_to(self.root).parts
+        name = place.name if above == (SCANS,) else "-".join([*above, place.name])
+        place.rename(self.orphans / name)
+
+    def keep_bundle(self, job_id: UUID, place: Path) -> None:
+        """Put the bundle of a job that came to nothing in its place, whole or cut short, and nothing else of it. Does
+        nothing where none was recorded.
+        """
+        if self.recording(job_id).is_dir():
+            self.keep_recording(job_id)
+        if not (self.staging(job_id) / BUNDLE).is_dir():
+            return
+        self.clear_results(job_id)
+        self.put(job_id, place)
 
     def clear_results(self, scan_id: UUID) -> Path:
         """Remove all that is staged for a scan but its bundle, and return the staging folder."""
@@ -267,17 +273,17 @@ class DataFolder:
         """Remove what was staged for a scan. Idempotent."""
         shutil.rmtree(self.staging(scan_id), ignore_errors=True)
 
-    def withdraw(self, scan_id: UUID) -> None:
-        """Take a finished scan's files back into staging by one rename: the first half of a deletion."""
-        if os.path.lexists(self.scan(scan_id)):
-            with disk_errors(self.scans):
-                self.scan(scan_id).rename(self.staging(scan_id))
+    def withdraw(self, place: Path, job_id: UUID) -> None:
+        """Take the files of a job back into staging by one rename: the first half of a deletion."""
+        if os.path.lexists(place):
+            with disk_errors(place):
+                place.rename(self.staging(job_id))
 
 
-def missing_files(scan: Path) -> list[str]:
-    """What a scan that succeeded must have, and is not in its folder. A link is no file and no folder of ours."""
-    is_ours = not scan.is_symlink()
-    return [name for name in _PROMISED if not (is_ours and (scan / name).is_file() and not (scan / name).is_symlink())]
+def missing_files(place: Path, promised: Iterable[str]) -> list[str]:
+    """The promised files that are not in a folder. A link is no file and no folder of ours."""
+    is_ours = not place.is_symlink()
+    return [name for name in promised if not (is_ours and (place / name).is_file() and not (place / name).is_symlink())]
 
 
 def remove(path: Path) -> None:

@@ -1,83 +1,196 @@
-"""Work with the rig: a piece of it, and who it is named by while it holds the rig."""
+"""One kind of work: what a job is asked to do, what it is given while it does it, and what it found."""
 
 from __future__ import annotations
 
 import math
-import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from datetime import datetime
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, Self
 from uuid import UUID
 
-from slrig.errors import RigBusyError
+from pydantic import TypeAdapter
+
+from slrig.capture import EvidenceSummary
+from slrig.failure import JobFailure
+from slrig.jobs.data_folder import BUNDLE, RESULT, DataFolder
+from slrig.jobs.frame_feed import FrameSink
+from slrig.jobs.records import JobKind, JobRecord
+from slrig.model import Region
 from slrig.rig.session import RigSession
 
 
+class Recording(Protocol):
+    """A bundle whose frames have all been taken, and may still be on their way to the disk."""
+
+    def finish(self) -> None:
+        """Bring the bundle to its place. Raises StorageError."""
+        ...
+
+    def discard(self) -> None:
+        """Remove it."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
-class Holder:
-    """Who holds the rig. name : what an answer calls it, the id of a scan; words : the same for a person; path : where
-    it is found over HTTP, below which `cancel` ends it; None for what is over in seconds.
+class Outcome:
+    """What a job found. summary : JSON values, as a list shows them. fault : why it failed although it came to its end,
+    as a pose that cannot be used; its files are kept. None where it succeeded.
     """
 
-    name: str
-    words: str
-    path: str | None
+    summary: Mapping[str, Any] | None = None
+    fault: JobFailure | None = None
 
 
-@dataclass(slots=True, eq=False)
-class Job:
-    """A piece of work with the rig. Its first end stands: whatever ends it again later is not told.
+@dataclass(frozen=True, slots=True, eq=False)
+class JobRun:
+    """What a job is given while it runs: with the rig, and then in the worker.
 
-    work : called on the thread that owns the rig; the projector is darkened afterwards, whatever happened. None where
-    only the second part is left to be done. compute : the second part, called on a thread of its own when the rig is
-    free for the next job; None where there is none. clear_up : does what remains, on the same thread as the part that
-    was done last; after `work` the rig is not free yet. concluded : takes note, on any thread, how it ended; a lock is
-    held: it returns at once. ended : called once, when the rig is free. These three are given what was raised, None
-    where nothing was. due_s : by `time.monotonic`, before which it does not begin and others may pass it. stop : set
-    when it is to end early.
+    folder : where its files are made; it is moved to `place` as a whole when the job has come to its end. place : None
+    where nothing is kept. report : takes the stage, the fraction of this part that is done, and a detail for people.
+    file_ready : takes the name of a file that can be fetched before the job is over. frames : takes the frames of a
+    capture while they come; None where nobody computes with them meanwhile. live : in the worker, what took them.
+    evidence : what the frames proved as they were captured. where : where it is computed, for a report. pipeline : the
+    module that the worker has prepared: `slrig.scan.reconstruct`.
     """
 
     id: UUID
-    holder: Holder
-    since: datetime
-    work: Callable[[RigSession, Job], object] | None
-    ended: Callable[[Exception | None], None]
-    compute: Callable[[Job], None] | None = None
-    clear_up: Callable[[Exception | None], None] = lambda _: None
-    concluded: Callable[[Exception | None], None] = lambda _: None
-    due_s: float = -math.inf
-    stop: threading.Event = field(default_factory=threading.Event)
-    _error: Exception | None = None
-    _noted: bool = False
-    _telling: threading.Lock = field(default_factory=threading.Lock)
-    _told: bool = False
+    folder: Path
+    place: Path | None
+    report: Callable[[str, float, str], None]
+    cancelled: Callable[[], bool]
+    file_ready: Callable[[str], None] = lambda _: None
+    frames: FrameSink | None = None
+    live: Any = None
+    evidence: EvidenceSummary | None = None
+    where: Mapping[str, str] = field(default_factory=lambda: {"where": "local"})
+    pipeline: Any = None
 
     @property
-    def ended_by(self) -> Exception | None:
-        """What has ended it, perhaps while it still was under way; None before that, or where nothing has."""
-        return self._error
+    def recording(self) -> Path:
+        """Where frames are recorded. It becomes `bundle` when all of them are on the disk."""
+        return self.folder / "recording"
 
-    def conclude(self, error: Exception | None) -> None:
-        """Take note of its end, with the lock held under which the rig is given and taken."""
-        if not self._noted:
-            self._error, self._noted = error, True
-            self.concluded(error)
+    @property
+    def bundle(self) -> Path:
+        """The frames, once they are on the disk."""
+        return self.folder / BUNDLE
 
-    def settle(self) -> None:
-        """Tell how it ended, if that was noted. The rig is free; on any thread."""
-        with self._telling:
-            if not self._noted or self._told:
-                return
-            self._told = True
-        self.ended(self._error)
+    @property
+    def result(self) -> Path:
+        """Where files are made that can be fetched at once: see `file_ready`. They belong beside the bundle."""
+        return self.folder / RESULT
 
 
-def busy(job: Job) -> RigBusyError:
-    """The error that names who holds the rig."""
-    since = job.since.isoformat(timespec="seconds")
-    cancel = "" if job.holder.path is None else f"cancel it with POST {job.holder.path}/cancel, "
-    message = (
-        f'The rig is held by {job.holder.words} since {since}. Wait for it, {cancel}or send "if_busy": "queue" to wait '
-        "in line."
-    )
-    return RigBusyError(message, holder=job.holder.name, since=since)
+class Job:
+    """One kind of work: a frozen dataclass whose fields are its plan. It is sent to the worker, and holds data alone.
+
+    uses_rig : whether it captures. computes : whether anything is left to do when the rig is free. feeds : whether the
+    worker takes frames while they are captured. keeps_bundle : whether frames are kept where it failed. one_at_a_time :
+    whether those of one group are computed one after the other, each by what came of those before it. movable : whether
+    another machine may compute it, from its bundle alone. promises : the files without which it has not succeeded.
+    remedy : what a person can do when the worker is lost. noun : what is computed.
+    """
+
+    kind: ClassVar[JobKind]
+    uses_rig: ClassVar[bool] = True
+    computes: ClassVar[bool] = True
+    feeds: ClassVar[bool] = False
+    keeps_bundle: ClassVar[bool] = False
+    one_at_a_time: ClassVar[bool] = False
+    movable: ClassVar[bool] = False
+    promises: ClassVar[tuple[str, ...]] = ()
+    remedy: ClassVar[str] = "Try again."
+    noun: ClassVar[str] = "job"
+
+    @property
+    def parent(self) -> UUID | None:
+        """What it belongs to: a series, a calibration, an acceptance test, a model; None where it stands alone. A field
+        `group` says it, and is no part of the plan.
+        """
+        group: UUID | None = getattr(self, "group", None)
+        return group
+
+    @property
+    def capture_share(self) -> float:
+        """The part of its progress that is capture."""
+        return 1.0 if self.uses_rig else 0.0
+
+    @property
+    def ready(self) -> bool:
+        """False while it cannot be begun, as a model whose views are being shot."""
+        return True
+
+    @property
+    def region(self) -> Region | None:
+        """What of the scene the worker computes while frames come; None for all."""
+        return None
+
+    @property
+    def due_in_s(self) -> float:
+        """Seconds before which it does not begin; others may pass it."""
+        return -math.inf
+
+    def document(self) -> dict[str, Any]:
+        """Its plan as JSON values."""
+        document: dict[str, Any] = _adapter(type(self)).dump_python(self, mode="json", exclude={"group"})
+        return document
+
+    @classmethod
+    def from_record(cls, record: JobRecord) -> Self:
+        """The job that is on record."""
+        group = {} if record.parent is None else {"group": record.parent}
+        job: Self = _adapter(cls).validate_python({**record.plan, **group})
+        return job
+
+    def check(self, rig: RigSession) -> int:  # noqa: ARG002 - for those that use it
+        """Raise what the rig cannot do of this, as far as it is known; return the bytes that are needed on the disk."""
+        return 0
+
+    def capture(self, rig: RigSession, run: JobRun) -> Recording | None:
+        """Use the rig, on its thread. What is returned is on its way to `run.recording`; None where nothing is."""
+        raise NotImplementedError
+
+    def compute(self, run: JobRun) -> Outcome:
+        """Do the mathematics, in the worker, in `run.folder`."""
+        raise NotImplementedError
+
+    def place(self, data: DataFolder, job_id: UUID) -> Path | None:  # noqa: ARG002 - for those that keep files
+        """Where its files belong; None where none are kept."""
+        return None
+
+    @classmethod
+    def places(cls, data: DataFolder) -> Iterable[Path]:  # noqa: ARG003
+        """Where files of jobs of this kind lie."""
+        return ()
+
+
+class Group(Protocol):
+    """What jobs of a kind belong to, and what is learnt from them: a calibration, an acceptance test, a model, the
+    health of the rig. It is told before others can see that a job is further, on whatever thread.
+    """
+
+    def captured(self, job: Job, job_id: UUID) -> None:
+        """Take note that the rig is free of a job, which is to be computed now."""
+        ...
+
+    def ended(self, job: Job, job_id: UUID, outcome: Outcome | None) -> Outcome:
+        """Take note of a job whose files are in their place; return what is to be on record of it. outcome : None where
+        it came to nothing.
+        """
+        ...
+
+
+_adapters: dict[type[Job], TypeAdapter[Any]] = {}
+
+
+def _adapter(kind: type[Job]) -> TypeAdapter[Any]:
+    if kind not in _adapters:
+        _adapters[kind] = TypeAdapter(kind)
+    return _adapters[kind]
+
+
+def due_s(job: Job) -> float:
+    """When a job may begin, by `time.monotonic`."""
+    return time.monotonic() + job.due_in_s

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from enum import StrEnum
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 from uuid import UUID
 
+from pydantic import TypeAdapter, ValidationError
+
+from slrig.bundle import write_file
 from slrig.failure import JobFailure
+
+RECORD = "record.json"
+"""The file beside those of a finished job that has its record."""
 
 Clock = Callable[[], datetime]
 """Gives the present moment with a time zone."""
@@ -112,6 +120,54 @@ class JobRecord:
     requested_by: str | None = None
 
 
+_record_adapter = TypeAdapter(JobRecord)
+
+
+def write_record(folder: Path, record: JobRecord) -> None:
+    """Write the record of a finished job into its folder, for a database that was lost. Raises StorageError."""
+    write_file(folder / RECORD, _record_adapter.dump_json(record, indent=1))
+
+
+def read_record(folder: Path) -> JobRecord | None:
+    """The record in the folder of a finished job; None where there is none that can be read."""
+    try:
+        return _record_adapter.validate_json((folder / RECORD).read_bytes())
+    except (OSError, ValidationError):
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class Holder:
+    """Who holds the rig. name : what an answer calls it, the id of a scan; words : the same for a person; path : where
+    it is found over HTTP, below which `cancel` ends it; None for what is over in seconds.
+    """
+
+    name: str
+    words: str
+    path: str | None
+
+
+def holder_of(record: JobRecord) -> Holder:
+    """Who holds the rig for a job."""
+    job, group = f"{record.kind} {record.id}", record.parent
+    match record.kind:
+        case JobKind.SCAN:
+            return Holder(str(record.id), job, f"/scan/{record.id}")
+        case JobKind.VERIFICATION:
+            return Holder(job, job, f"/rig/verification/{record.id}")
+        case JobKind.POSE:
+            words = f"calibration {group}, pose {record.plan['number']}"
+            return Holder(words, words, f"/calibration/{group}/pose/{record.plan['number']}")
+        case JobKind.SOLVE:
+            words = f"calibration {group}, solve {record.plan['number']}"
+            return Holder(words, words, f"/calibration/{group}")
+        case JobKind.POSITION:
+            words = f"acceptance test {group}"
+            return Holder(words, words, f"/acceptance/{group}")
+        case JobKind.MODEL:
+            return Holder(job, job, f"/model/{record.id}")
+
+
 _PARENTS = {
     JobKind.SCAN: ("series", "/scan/series"),
     JobKind.POSE: ("calibration", "/calibration"),
@@ -155,3 +211,44 @@ class JobEvent:
 def stamp(moment: datetime) -> str:
     """A moment as it stands on record."""
     return moment.isoformat(timespec="milliseconds")
+
+
+STAGES_S = "stages_s"
+"""Where the summary of a job has the seconds of each stage of its computation, in their order."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A stretch of a job. inside : the name of the stretch that it is a part of, None where it is one of the job's."""
+
+    name: str
+    begin: datetime
+    end: datetime
+    inside: str | None = None
+
+    @property
+    def seconds(self) -> float:
+        """How long it took."""
+        return (self.end - self.begin).total_seconds()
+
+
+def stages_of(record: JobRecord, events: Sequence[JobEvent]) -> Iterator[Stage]:
+    """The states that an ended job was in, and below `computing` the stages of the computation, one after the other.
+
+    Of those only the seconds are known: a stage that was entered twice is one here, and what was computed while frames
+    still came lies a little late.
+    """
+    changes = [
+        (event.data["state"], datetime.fromisoformat(event.data["time"])) for event in events if _is_state(event)
+    ]
+    for (state, begin), (_, end) in pairwise(changes):
+        yield Stage(state, begin, end)
+        if state == JobState.COMPUTING:
+            for name, seconds in ((record.summary or {}).get(STAGES_S) or {}).items():
+                following = begin + timedelta(seconds=seconds)
+                yield Stage(name, begin, following, inside=state)
+                begin = following
+
+
+def _is_state(event: JobEvent) -> bool:
+    return event.kind == "state" and "time" in event.data

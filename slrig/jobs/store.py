@@ -9,17 +9,28 @@ from datetime import datetime
 from typing import Any
 from uuid import UUID, uuid4
 
-from sqlalchemy import delete, func, select, text
+from sqlalchemy import Select, delete, func, select, text
 from sqlalchemy.orm import Session
 
 from slrig.errors import JobNotFoundError
 from slrig.failure import JobFailure
 from slrig.jobs.database import Database
 from slrig.jobs.outbox import Outbox
-from slrig.jobs.records import Clock, JobEvent, JobKind, JobProgress, JobRecord, JobState, actor, stamp, utc_now
+from slrig.jobs.records import (
+    Clock,
+    JobEvent,
+    JobKind,
+    JobProgress,
+    JobRecord,
+    JobState,
+    actor,
+    reference,
+    stamp,
+    utc_now,
+)
 from slrig.jobs.tables import EventRow, JobRow, KeyRow, record_of
 
-_LISTED = {
+_LISTED: dict[str, str] = {
     JobKind.SCAN: "GET /scan lists those that are.",
     JobKind.VERIFICATION: "GET /rig/health/history lists past ones.",
     JobKind.MODEL: "GET /model lists those that are.",
@@ -31,51 +42,47 @@ EVERY_JOB = UUID(int=0)
 
 
 class JobStore:
-    """Jobs of one kind, or of a few that belong together. Any thread of the one process that owns it may call.
+    """The jobs of all kinds. Any thread of the one process that owns it may call.
 
-    outbox : where notices of their ends are put; without one nobody is told.
+    outbox : where notices of their ends are put; without one nobody is told. kinds, of any method : which are meant;
+    all where none is named.
     """
 
-    def __init__(
-        self, database: Database, *kinds: JobKind, clock: Clock = utc_now, outbox: Outbox | None = None
-    ) -> None:
-        self.kinds = kinds
+    def __init__(self, database: Database, *, clock: Clock = utc_now, outbox: Outbox | None = None) -> None:
+        self.ended = False
+        """Whether nothing more will happen in this run of the service."""
         self._clock = clock
         self._watching = threading.Lock()
         self._watchers: dict[UUID, list[Callable[[], None]]] = defaultdict(list)
         self.database = database
         self.outbox = outbox or Outbox(database)
         self.after_end: Callable[[JobRecord], None] = lambda _: None
-        """Told of each job of this store that comes to its end, once that is on record. It must not raise."""
+        """Called with each job that comes to its end, once that is on record. It must not raise."""
 
     def check(self) -> None:
         """Raise StorageError unless the database answers."""
         with self.database.reading() as session:
             session.execute(text("SELECT 1"))
 
-    def create(
+    def create(self, plan: Mapping[str, Any], **options: Any) -> JobRecord:
+        """Record one new job, with the options of `create_all`."""
+        return self.create_all([plan], **options)[0]
+
+    def create_all(
         self,
-        plan: Mapping[str, Any],
+        plans: Sequence[Mapping[str, Any]],
         *,
+        kind: JobKind,
         rig: str,
-        label: str | None,
+        label: str | None = None,
+        parent: UUID | None = None,
         key: str | None = None,
         job_id: UUID | None = None,
-        kind: JobKind | None = None,
-        parent: UUID | None = None,
-    ) -> JobRecord:
-        """Record a new job as queued and, in the same transaction, tie its idempotency key to it. kind : one of the
-        store's, its first by default.
-        """
-        row = _new_row(job_id or uuid4(), kind or self.kinds[0], plan, rig=rig, label=label, parent=parent)
-        return self._queued([row], key)[0]
-
-    def create_series(
-        self, plans: Sequence[Mapping[str, Any]], *, rig: str, label: str | None, parent: UUID, key: str | None = None
     ) -> list[JobRecord]:
-        """Record jobs of one parent as queued, all of them or none; the key is that of the first."""
-        kind = self.kinds[0]
-        rows = [_new_row(uuid4(), kind, plan, rig=rig, label=label, parent=parent) for plan in plans]
+        """Record new jobs as waiting, all of them or none, and in the same transaction tie an idempotency key to the
+        first. job_id : of a single one; a new id by default.
+        """
+        rows = [_new_row(job_id or uuid4(), kind, plan, rig=rig, label=label, parent=parent) for plan in plans]
         return self._queued(rows, key)
 
     def _queued(self, rows: Sequence[JobRow], key: str | None) -> list[JobRecord]:
@@ -91,62 +98,55 @@ class JobStore:
         self.wake(EVERY_JOB, *{record.parent for record in made})
         return made
 
-    def restore(
-        self,
-        job_id: UUID,
-        plan: Mapping[str, Any],
-        summary: Mapping[str, Any],
-        *,
-        rig: str,
-        label: str | None,
-        created_at: datetime,
-        started_at: datetime,
-        fault: JobFailure | None = None,
-        parent: UUID | None = None,
-    ) -> None:
-        """Put a job that ended on record again. How it went is not known any more; its end is taken for now. Whether it
-        was pinned is not known either: it is pinned. fault : why it failed, None where it succeeded.
+    def restore(self, kept: JobRecord) -> None:
+        """Put a job that ended on record again, as its files say. Its end is taken for now. Whether it was pinned is
+        not known: it is pinned.
         """
-        row = _new_row(job_id, self.kinds[0], plan, rig=rig, label=label, parent=parent)
-        row.state, row.created_at, row.stage, row.pinned = JobState.SUCCEEDED, stamp(created_at), "", True
-        row.started_at = stamp(started_at)
+        row = _new_row(kept.id, kept.kind, kept.plan, rig=kept.rig, label=kept.label, parent=kept.parent)
+        row.state, row.created_at, row.stage, row.pinned = JobState.SUCCEEDED, stamp(kept.created_at), "", True
+        row.started_at = stamp(kept.started_at or kept.created_at)
+        state = JobState.SUCCEEDED if kept.fault is None else JobState.FAILED
         with self.database.changing() as session:
             session.add(row)
             session.flush()
-            self._close_row(session, row, JobState.SUCCEEDED if fault is None else JobState.FAILED, fault, summary)
+            self._close_row(session, row, state, kept.fault, kept.summary)
 
-    def get(self, job_id: UUID) -> JobRecord:
-        """Return a job. Raises JobNotFoundError."""
+    def get(self, job_id: UUID, *kinds: JobKind) -> JobRecord:
+        """Return a job. Raises JobNotFoundError, also where it is of another kind."""
         with self.database.reading() as session:
-            return record_of(self._find(session, job_id))
+            return record_of(self._find(session, job_id, *kinds))
 
-    def page(self, *, before: int | None, limit: int) -> Sequence[JobRecord]:
+    def page(self, *kinds: JobKind, before: int | None, limit: int) -> Sequence[JobRecord]:
         """Return up to `limit` jobs, newest first, whose number is below `before`."""
-        query = select(JobRow).where(JobRow.kind.in_(self.kinds)).order_by(JobRow.number.desc()).limit(limit)
+        query = _jobs(*kinds).order_by(JobRow.number.desc()).limit(limit)
         if before is not None:
             query = query.where(JobRow.number < before)
         with self.database.reading() as session:
             return [record_of(row) for row in session.scalars(query)]
 
-    def unfinished(self) -> Sequence[JobRecord]:
+    def unfinished(self, *kinds: JobKind) -> Sequence[JobRecord]:
         """Return the jobs that are in no final state, oldest first."""
         running = [state for state in JobState if not state.final]
-        query = select(JobRow).where(JobRow.kind.in_(self.kinds), JobRow.state.in_(running)).order_by(JobRow.number)
+        query = _jobs(*kinds).where(JobRow.state.in_(running)).order_by(JobRow.number)
         with self.database.reading() as session:
             return [record_of(row) for row in session.scalars(query)]
 
-    def finished(self) -> Sequence[JobRecord]:
+    def finished(self, *kinds: JobKind) -> Sequence[JobRecord]:
         """Return the jobs that are in a final state, newest first."""
         running = [state for state in JobState if not state.final]
-        query = select(JobRow).where(JobRow.kind.in_(self.kinds), JobRow.state.not_in(running))
+        query = _jobs(*kinds).where(JobRow.state.not_in(running))
         with self.database.reading() as session:
             return [record_of(row) for row in session.scalars(query.order_by(JobRow.number.desc()))]
 
-    def of(self, *parents: UUID) -> dict[UUID, list[JobRecord]]:
-        """Return the jobs of each parent, oldest first; without a parent named, those of all that have one."""
-        query = select(JobRow).where(JobRow.kind.in_(self.kinds), JobRow.parent.is_not(None)).order_by(JobRow.number)
-        if parents:
-            query = query.where(JobRow.parent.in_(map(str, parents)))
+    def of(self, parent: UUID) -> list[JobRecord]:
+        """Return the jobs of a parent, oldest first."""
+        query = select(JobRow).where(JobRow.parent == str(parent)).order_by(JobRow.number)
+        with self.database.reading() as session:
+            return [record_of(row) for row in session.scalars(query)]
+
+    def by_parent(self, *kinds: JobKind) -> dict[UUID, list[JobRecord]]:
+        """Return the jobs of every parent, oldest first."""
+        query = _jobs(*kinds).where(JobRow.parent.is_not(None)).order_by(JobRow.number)
         found: dict[UUID, list[JobRecord]] = defaultdict(list)
         with self.database.reading() as session:
             for row in session.scalars(query):
@@ -165,17 +165,17 @@ class JobStore:
         states = [event.data["state"] for event in self.events(job_id, after=0) if event.kind == "state"]
         return states.count(JobState.COMPUTING)
 
-    def pin(self, job_id: UUID, *, pinned: bool) -> JobRecord:
+    def pin(self, job_id: UUID, *kinds: JobKind, pinned: bool) -> JobRecord:
         """Have a job kept by every retention, or not any more. Raises JobNotFoundError."""
         with self.database.changing() as session:
-            row = self._find(session, job_id)
+            row = self._find(session, job_id, *kinds)
             row.pinned = pinned
             return record_of(row)
 
-    def states(self) -> dict[UUID, JobState]:
+    def states(self, *kinds: JobKind) -> dict[UUID, JobState]:
         """Return the state of every job on record."""
         with self.database.reading() as session:
-            query = select(JobRow.id, JobRow.state).where(JobRow.kind.in_(self.kinds))
+            query = select(JobRow.id, JobRow.state).where(JobRow.kind.in_(kinds or JobKind))
             return {UUID(found): JobState(state) for found, state in session.execute(query)}
 
     def advance(self, job_id: UUID, state: JobState) -> datetime:
@@ -245,12 +245,12 @@ class JobStore:
     def delete_of(self, parent: UUID) -> None:
         """Forget the jobs of a parent that is gone."""
         with self.database.changing() as session:
-            session.execute(delete(JobRow).where(JobRow.kind.in_(self.kinds), JobRow.parent == str(parent)))
+            session.execute(delete(JobRow).where(JobRow.parent == str(parent)))
         self.wake(parent)
 
-    def prune(self, keep: int) -> None:
-        """Forget the oldest finished jobs, so that `keep` are left."""
-        query = select(JobRow).where(JobRow.kind.in_(self.kinds)).order_by(JobRow.number.desc()).offset(keep)
+    def prune(self, kind: JobKind, keep: int) -> None:
+        """Forget the oldest finished jobs of a kind, so that `keep` are left."""
+        query = _jobs(kind).order_by(JobRow.number.desc()).offset(keep)
         with self.database.changing() as session:
             for row in session.scalars(query):
                 if JobState(row.state).final:
@@ -269,7 +269,7 @@ class JobStore:
         query = (
             select(EventRow)
             .join(JobRow, JobRow.id == EventRow.job_id)
-            .where(JobRow.kind.in_(self.kinds), JobRow.parent == str(parent), EventRow.id > after)
+            .where(JobRow.parent == str(parent), EventRow.id > after)
             .order_by(EventRow.id)
         )
         with self.database.reading() as session:
@@ -279,8 +279,29 @@ class JobStore:
         """Return the number of the newest event of all jobs of a parent, 0 before the first."""
         events = select(func.max(EventRow.id)).join(JobRow, JobRow.id == EventRow.job_id)
         with self.database.reading() as session:
-            found = session.scalar(events.where(JobRow.kind.in_(self.kinds), JobRow.parent == str(parent)))
+            found = session.scalar(events.where(JobRow.parent == str(parent)))
         return found or 0
+
+    def events_of_all(self, *, after: int, limit: int) -> Sequence[JobEvent]:
+        """Return the first events of all jobs whose number is above `after`, at most `limit`, in order; their data name
+        the job: see `reference`. Numbers rise over all jobs, with gaps: those of a job go with it.
+        """
+        query = select(EventRow, JobRow).join(JobRow, JobRow.id == EventRow.job_id).where(EventRow.id > after)
+        with self.database.reading() as session:
+            return [
+                JobEvent(event.id, event.kind, {**event.data, "job": reference(record_of(job))}, UUID(job.id))
+                for event, job in session.execute(query.order_by(EventRow.id).limit(limit))
+            ]
+
+    def last_event_of_all(self) -> int:
+        """Return the number of the newest event, 0 before the first."""
+        with self.database.reading() as session:
+            return session.scalar(select(func.max(EventRow.id))) or 0
+
+    def end(self) -> None:
+        """Nothing more will happen in this run of the service."""
+        self.ended = True
+        self.wake(EVERY_JOB)
 
     def last_event(self, job_id: UUID) -> int:
         """Return the number of a job's newest event. Raises JobNotFoundError."""
@@ -302,10 +323,11 @@ class JobStore:
 
         return unwatch
 
-    def _find(self, session: Session, job_id: UUID) -> JobRow:
-        row = session.scalar(select(JobRow).where(JobRow.id == str(job_id), JobRow.kind.in_(self.kinds)))
+    def _find(self, session: Session, job_id: UUID, *kinds: JobKind) -> JobRow:
+        row = session.scalar(_jobs(*kinds).where(JobRow.id == str(job_id)))
         if row is None:
-            message = f"No {self.kinds[0]} {job_id} is on record here. {_LISTED.get(self.kinds[0], '')}".rstrip()
+            kind = kinds[0] if kinds else "job"
+            message = f"No {kind} {job_id} is on record here. {_LISTED.get(kind, '')}".rstrip()
             raise JobNotFoundError(message)
         return row
 
@@ -342,6 +364,10 @@ class JobStore:
         self.wake(EVERY_JOB, job_id, None if parent is None else UUID(parent))
 
 
+def _jobs(*kinds: JobKind) -> Select[JobRow]:
+    return select(JobRow).where(JobRow.kind.in_(kinds or JobKind))
+
+
 def _new_row(
     job_id: UUID, kind: JobKind, plan: Mapping[str, Any], *, rig: str, label: str | None, parent: UUID | None
 ) -> JobRow:
@@ -363,10 +389,3 @@ def _new_row(
 def _append(session: Session, row: JobRow, kind: str, data: dict[str, Any]) -> None:
     row.last_event += 1
     session.add(EventRow(job_id=row.id, number=row.last_event, kind=kind, data=data))
-
-
-def unfinished_ids(database: Database) -> set[str]:
-    """The jobs of every kind that are in no final state."""
-    running = [state for state in JobState if not state.final]
-    with database.reading() as session:
-        return set(session.scalars(select(JobRow.id).where(JobRow.state.in_(running))))

@@ -254,14 +254,6 @@ class Worker:
         with self._guard:
             self._note(told)
 
-    def task(self, function: str, what: str) -> Callable[..., Any]:
-        """A function of the mathematics, "module:function", done by the worker; see `run` for the two callables."""
-
-        def call(*given: Any, progress: Told = _silent, cancelled: Callable[[], bool] = _never, **options: Any) -> Any:
-            return self.run(Task(function, given, options, what=what), progress=progress, cancelled=cancelled)
-
-        return call
-
     @contextmanager
     def _its_turn(
         self, task: Task, progress: Told, cancelled: Callable[[], bool], until_s: float | None

@@ -7,23 +7,25 @@ another number than that of the job that is waited for belongs to nobody, and is
 from __future__ import annotations
 
 import importlib
-import inspect
 import signal
 import threading
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from ctypes import c_double
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
+from uuid import UUID
 
 import structlog
 
+from slrig.capture import EvidenceSummary
 from slrig.failure import JobFailure, job_failure
 from slrig.jobs.frame_feed import FedCaptures
+from slrig.jobs.job import JobRun
 from slrig.logs import LogSettings, set_up_logs
 
 _log = structlog.get_logger(__name__)
@@ -33,19 +35,27 @@ HEARTBEAT_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
-    """A task of the worker: a function that is named rather than passed, so that the service need not load it.
+class JobFiles:
+    """Where the files of a job are made, and where they belong; what its frames proved as they were captured."""
 
-    function : "module:function". It is given `progress`, `cancelled` and `made` if it takes arguments of these names,
-    and `live`, what received the frames of a capture, if there were any. what : the task in words. remedy : what a
-    person can do when the worker is lost in the middle of it. movable : `given` begins with a folder that is read and
-    one that is filled, and nothing else of this machine is needed: another one may do it. where : how it came to be
-    done where it is, for a report; the function is given it if it takes an argument of this name.
+    id: UUID
+    folder: Path
+    place: Path | None = None
+    evidence: EvidenceSummary | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A task of the worker: a call of a function, which is found there by its name and loads its mathematics itself.
+
+    files : of a job, whose `Job.compute` the function is: it is given a `JobRun`. what : the task in words. remedy :
+    what a person can do when the worker is lost in the middle of it. movable : the bundle among its files is all that
+    is needed: another machine may do it. where : how it came to be done where it is, for a report.
     """
 
-    function: str
+    function: Callable[..., Any]
     given: tuple[Any, ...] = ()
-    options: Mapping[str, Any] = field(default_factory=dict)
+    files: JobFiles | None = None
     what: str = "task"
     remedy: str = "Try again."
     movable: bool = False
@@ -155,8 +165,8 @@ def serve(
     """The child's life: prepare, then do jobs until the parent's end of the pipe is gone.
 
     stops : brings the numbers of jobs that are not wanted any more, past whatever waits in the pipe. heartbeat : takes
-    the time of the last sign of life, `time.monotonic`. module : offers `warm_kernels(told)`, and `frame_receiver()`,
-    what the frames of a capture are told to. logs : how the parent logs.
+    the time of the last sign of life, `time.monotonic`. module : offers `warm_kernels(told)`, `frame_receiver()`,
+    what the frames of a capture are told to, and what jobs find as `JobRun.pipeline`. logs : how the parent logs.
     """
     if logs is not None:
         set_up_logs(logs.level, logs.form)
@@ -180,7 +190,7 @@ def serve(
             live = fed.taken(message.number) if message.fed else None
             try:
                 with structlog.contextvars.bound_contextvars(**message.named):
-                    answer = _answer(pipe, stops, message, live)
+                    answer = _answer(pipe, stops, message, loaded, live)
             except (ConnectionError, EOFError):
                 return
             del live
@@ -202,7 +212,7 @@ def _be_ended_first() -> None:
         Path("/proc/self/oom_score_adj").write_text("500")
 
 
-def _answer(pipe: Connection, stops: Connection, run: RunTask, live: Any) -> Done | Failed:
+def _answer(pipe: Connection, stops: Connection, run: RunTask, pipeline: Any, live: Any) -> Done | Failed:
     stopped = False
     # A task may tell of its progress from several threads.
     telling = threading.Lock()
@@ -221,20 +231,17 @@ def _answer(pipe: Connection, stops: Connection, run: RunTask, live: Any) -> Don
             stopped = stops.recv() == run.number or stopped
         return stopped
 
+    task, files = run.task, run.task.files
     try:
-        given = {"progress": progress, "cancelled": cancelled, "made": made, "where": run.task.where}
-        if live is not None:
-            given["live"] = live
-        return Done(run.number, _called(run.task, given))
+        if files is None:
+            return Done(run.number, task.function(*task.given))
+        job_run = JobRun(
+            files.id, files.folder, files.place, progress, cancelled, made,
+            live=live, evidence=files.evidence, where=task.where, pipeline=pipeline,
+        )  # fmt: skip
+        return Done(run.number, task.function(job_run))
     except (ConnectionError, EOFError):
         # The parent is gone: nobody waits for an answer.
         raise
     except Exception as error:  # noqa: BLE001 - the traceback travels to the parent, which logs it
         return Failed(run.number, job_failure(error), traceback.format_exc())
-
-
-def _called(task: Task, given: dict[str, Any]) -> Any:
-    module, _, name = task.function.partition(":")
-    function = getattr(importlib.import_module(module), name)
-    taken = inspect.signature(function).parameters
-    return function(*task.given, **task.options, **{name: each for name, each in given.items() if name in taken})

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import structlog
 
@@ -66,10 +67,10 @@ def driver_errors(rig: str) -> Iterator[None]:
 
 
 class RigSession:
-    """A rig and the one thread that may touch it: all but `calls`, `facts`, `settings`, `fault`, `active`,
-    `calibration`, `misfit`, `refuse_misfit`, `give_up` and `darken_from_outside` belong to it.
+    """A rig and the one thread that may touch it: all but `calls`, `facts`, `settings`, `fault`, `active`, `health`,
+    `calibration`, `misfit`, `refuse_misfit`, `use_calibration`, `give_up` and `darken_from_outside` belong to it.
 
-    Whoever sets `active` gives whatever is begun from then on that calibration in place of the rig's own. One that is
+    `active` gives whatever is begun from then on that calibration in place of the rig's own. One that is
     for other devices leaves the rig without any: the rig can still be calibrated, and a scan is refused.
 
     table_at : the file that keeps where a turntable stands, so that its angles go on from one opening to the next.
@@ -89,6 +90,8 @@ class RigSession:
         """Of each camera that was set since the rig was opened, by its name."""
         self.fault: JobFailure | None = None
         self.active: ActiveCalibration | None = None
+        self.health: Callable[[], Mapping[str, Any] | None] = lambda: None
+        """How well the calibration in use holds now, for the report of a scan; None before it was verified."""
         self._dropped = False
 
     def open(self) -> Rig:
@@ -134,6 +137,20 @@ class RigSession:
         except CalibrationError as error:
             return error
         return None
+
+    def use_calibration(self, active: ActiveCalibration | None) -> None:
+        """Have what is begun from now on use a calibration; None has it use the rig's own. On any thread.
+
+        Raises
+        ------
+        CalibrationError
+            It is for other devices than those of the open rig.
+        """
+        # Before the rig is open nobody knows; a scan is then refused with the same words.
+        fault = None if active is None else self.misfit(active)
+        if fault is not None:
+            raise fault
+        self.active = active
 
     def _fitting(self, active: ActiveCalibration) -> Calibration | None:
         return None if self.misfit(active) else active.calibration

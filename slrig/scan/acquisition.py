@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from statistics import geometric_mean
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import structlog
 
@@ -25,6 +25,7 @@ from slrig.bundle import (
     BundleWriter,
     RefusedFrame,
     TurntableAngle,
+    write_health,
     write_notes,
     write_truth,
     write_turntable_angle,
@@ -32,6 +33,7 @@ from slrig.bundle import (
 from slrig.capture import SETTINGS_TOLERANCE, choose_triggers, round_to_refresh_s
 from slrig.devices import Camera, Rig, Trigger, Turntable
 from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError
+from slrig.failure import disk_errors
 from slrig.jobs.frame_feed import FrameSink
 from slrig.model import CaptureHeader, Shot, Truth
 from slrig.rig.turn_count import CountedTurntable
@@ -59,12 +61,14 @@ class Recording:
         notes: Sequence[str],
         truth: Truth | None,
         turntable: TurntableAngle | None,
+        health: Mapping[str, Any] | None,
     ) -> None:
         self._folder = folder
         self._writing = writing
         self._notes = notes
         self._truth = truth
         self._turntable = turntable
+        self._health = health
 
     def finish(self) -> None:
         """Wait until the bundle is in its place, and write what belongs to it. Raises StorageError: the disk refused,
@@ -76,6 +80,9 @@ class Recording:
             write_truth(self._folder, self._truth)
         if self._turntable is not None:
             write_turntable_angle(self._folder, self._turntable)
+        if self._health is not None:
+            with disk_errors(self._folder):
+                write_health(self._folder, self._health)
 
     def discard(self) -> None:
         """Let it go. Nothing is left of it."""
@@ -161,6 +168,7 @@ def capture_frames(
     progress: ProgressCallback,
     cancelled: Callable[[], bool],
     frames: FrameSink | None = None,
+    health: Mapping[str, Any] | None = None,
 ) -> Recording:
     """Play the plan's patterns on the rig, and return when the last frame is proven. What comes back brings the bundle
     to `folder`, which must not exist.
@@ -168,6 +176,7 @@ def capture_frames(
     Where the plan says at which angle of the rig's turntable, that turns there first.
 
     `frames` is shown each frame that has passed its test, and once more the frames that took another one's place.
+    health : of the rig's calibration, for the bundle.
 
     Raises
     ------
@@ -227,7 +236,7 @@ def capture_frames(
             raise type(error)(message) from error
         if frames is not None:
             frames.end(exposing.summary())
-        return Recording(folder, writing.pop_all(), told, rig.truth(), turntable)
+        return Recording(folder, writing.pop_all(), told, rig.truth(), turntable, health)
 
 
 def _turned(rig: Rig, plan: ScanPlan, progress: ProgressCallback) -> TurntableAngle | None:

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import pairwise
 from statistics import geometric_mean, median
-from uuid import uuid4
 
 import numpy as np
 
 from slrig.capture import Evidence, Sampler, capture, round_to_refresh_s
 from slrig.devices import CameraSettings, Rig
 from slrig.errors import RigBusyError, UnsupportedByDeviceError
-from slrig.jobs.job import Holder, Job
-from slrig.jobs.queue import JobQueue
-from slrig.jobs.records import utc_now
+from slrig.jobs.manager import JobManager
+from slrig.jobs.records import Holder
 from slrig.model import Black, Shot, White
 from slrig.patterns import encode
-from slrig.rig.session import RigSession, driver_errors
+from slrig.rig.session import RigSession
 from slrig.scan.exposure_proposal import WELL_CLEAR, Look, Proposal, SeenObject, proposal, seen_object
 from slrig.scan.plan import ScanPlan
 from slrig.scan.plan_check import pattern_sequence
@@ -133,7 +130,7 @@ def _unclear(seen: Mapping[str, SeenObject], exposure_s: float) -> bool:
     return False
 
 
-def proposed_exposures(queue: JobQueue, plan: ScanPlan, *, budget_s: float | None) -> Proposal:
+def proposed_exposures(manager: JobManager, plan: ScanPlan, *, budget_s: float | None) -> Proposal:
     """Take the rig for some seconds, look, and propose exposures for a scan of a plan's patterns.
 
     Raises
@@ -145,45 +142,28 @@ def proposed_exposures(queue: JobQueue, plan: ScanPlan, *, budget_s: float | Non
     DeviceError, ScanInterruptedError
         As a scan does.
     """
-    found: list[tuple[Looking, int]] = []
-    errors: list[Exception | None] = []
-    over = threading.Event()
 
-    def work(held: RigSession, job: Job) -> None:
-        try:
-            with driver_errors(held.name):
-                rig = held.open()
-                frames = len(
-                    pattern_sequence(
-                        plan.patterns, rig.projector.info.size, rig.calibration, rig.cameras,
-                        axis=plan.reconstruction.axis, recorded=rig.projector.info.recorded,
-                        coloured_light=plan.coloured_light,
-                    )
-                )  # fmt: skip
-                looking = Looking(rig, cancelled=job.stop.is_set)
-                looking.look()
-                found.append((looking, frames))
-        except Exception as error:
-            held.doubt(error)
-            raise
+    def look(held: RigSession, cancelled: Callable[[], bool]) -> tuple[Looking, int]:
+        rig = held.open()
+        frames = len(
+            pattern_sequence(
+                plan.patterns, rig.projector.info.size, rig.calibration, rig.cameras,
+                axis=plan.reconstruction.axis, recorded=rig.projector.info.recorded,
+                coloured_light=plan.coloured_light,
+            )
+        )  # fmt: skip
+        looking = Looking(rig, cancelled=cancelled)
+        looking.look()
+        return looking, frames
 
-    def ended(error: Exception | None) -> None:
-        errors.append(error)
-        over.set()
-
-    job = Job(uuid4(), Holder("exposure", "a look at exposures, which takes seconds", None), utc_now(), work, ended)
     try:
-        queue.submit(lambda: [job], wait=False)
+        looking, frames = manager.lend(Holder("exposure", "a look at exposures, which takes seconds", None), look)
     except RigBusyError as error:
         message = (
             f"The rig is held by {error.holder} since {error.since}, and an object is looked at at once or not at all. "
             "Ask again when the rig is free"
         )
         raise RigBusyError(message, holder=error.holder, since=error.since) from error
-    over.wait()
-    if errors[0] is not None:
-        raise errors[0]
-    (looking, frames) = found[0]
     # The rig is free again.
     return proposal(
         looking.seen(), looking.candidates_s(), frames=frames, overhead_s=median(looking.overheads_s),

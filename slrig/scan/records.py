@@ -1,40 +1,17 @@
-"""What is on record about a scan: frozen values, and their JSON."""
+"""What is on record about a scan, as JSON values."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from datetime import datetime
-from pathlib import Path
 from typing import Any
-from uuid import UUID
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
-from slrig.bundle import write_file
-from slrig.jobs.timeline import STAGES_S
+from slrig.jobs.records import STAGES_S
 from slrig.scan.plan import ScanPlan
 
-_RECORD = "record.json"
-
 _plan_adapter = TypeAdapter(ScanPlan)
-
-
-@dataclass(frozen=True, slots=True)
-class KeptRecord:
-    """What a finished scan says of its own record, beside its files: enough to put it on record again."""
-
-    id: UUID
-    rig: str
-    label: str | None
-    plan: ScanPlan
-    created_at: datetime
-    started_at: datetime
-    requested_by: str | None = None
-
-
-_record_adapter = TypeAdapter(KeptRecord)
 
 
 def plan_json(plan: ScanPlan) -> dict[str, Any]:
@@ -50,19 +27,6 @@ def plan_json(plan: ScanPlan) -> dict[str, Any]:
 def plan_from_json(document: Mapping[str, Any]) -> ScanPlan:
     """The inverse of `plan_json`."""
     return _plan_adapter.validate_python(document)
-
-
-def write_record(folder: Path, record: KeptRecord) -> None:
-    """Write record.json into the folder of a scan. Raises StorageError."""
-    write_file(folder / _RECORD, _record_adapter.dump_json(record, indent=1))
-
-
-def read_record(folder: Path) -> KeptRecord | None:
-    """What the record.json of a scan's folder says; None where there is none that can be read."""
-    try:
-        return _record_adapter.validate_json((folder / _RECORD).read_bytes())
-    except (OSError, ValidationError):
-        return None
 
 
 def report_summary(report: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import structlog
 
 from slrig.errors import JobNotFoundError, ScanStateError, StorageError
 from slrig.jobs.data_folder import DataFolder
-from slrig.jobs.records import Clock, JobRecord, utc_now
+from slrig.jobs.records import Clock, JobKind, JobRecord, utc_now
 from slrig.jobs.store import JobStore
 
 LOOK_S = 3600.0
@@ -47,7 +47,7 @@ class ScanLimits:
 class ScanRetention:
     """Removes scans beyond the limits, oldest first, on a thread of its own. Any thread may call.
 
-    delete : `slrig.scan.runner.Runner.delete`.
+    delete : removes a scan, or raises ScanStateError where it is in use.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class ScanRetention:
         """The scans to remove, and why, oldest first. Those that are kept whatever they are count, too."""
         size_bytes = 0
         found = []
-        for count, record in enumerate(self._store.finished(), 1):
+        for count, record in enumerate(self._store.finished(JobKind.SCAN), 1):
             if self._limits.size_bytes is not None:
                 size_bytes += _size_bytes(self._folder.scan(record.id))
             why = self._why(record.finished_at or record.created_at, count, size_bytes)

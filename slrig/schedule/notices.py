@@ -6,12 +6,12 @@ from typing import get_args
 
 from sqlalchemy.orm import Session
 
+from slrig.calibrate.verification import HealthStore, VerificationRecord
 from slrig.calibration.health import HealthState
 from slrig.config import NoticeKind
 from slrig.jobs.database import Database
 from slrig.jobs.outbox import Outbox
 from slrig.schedule.records import RunState, Schedule, ScheduledRun
-from slrig.verify.store import HealthStore, VerificationRecord
 
 TOLD: dict[RunState, NoticeKind] = {
     RunState(kind.removeprefix("run.")): kind for kind in get_args(NoticeKind) if kind.startswith("run.")

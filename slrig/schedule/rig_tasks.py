@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import time
+import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 from uuid import UUID
 
 from slrig.accept.asking import AcceptanceRequest
-from slrig.accept.desk import AcceptanceDesk
+from slrig.accept.job import AcceptanceTests
 from slrig.accept.records import AcceptanceState
 from slrig.accept.verdicts import verdicts
-from slrig.calibrate.calibrating import CalibrationSessions
-from slrig.calibrate.pose_shooting import PoseRequest
+from slrig.calibrate.calibrating import Calibrations, PoseRequest
 from slrig.calibrate.records import SessionState
+from slrig.calibrate.verification import VerificationJob
 from slrig.calibration import Board
 from slrig.errors import (
     CalibrationError,
@@ -28,34 +28,43 @@ from slrig.errors import (
     WorkerLostError,
 )
 from slrig.failure import JobFailure, errors_by_code, job_failure
-from slrig.jobs.job import Holder
-from slrig.jobs.queue import JobQueue
-from slrig.jobs.records import JobState
+from slrig.jobs.manager import JobManager
+from slrig.jobs.records import Holder, JobState
+from slrig.jobs.store import JobStore
 from slrig.schedule.task_options import CalibrationOptions, VerificationOptions, require_positions
-from slrig.verify.job import VerificationDesk
-
-LOOK_S = 0.1
-"""How often work that somebody else does is looked at."""
 
 _TOLD = ("state", "reasons", "remedy", "expected_mm", "drift_mm", "scale_percent", "scale_mm")
 
 
-def until(
-    reached: Callable[[], bool], cancelled: Callable[[], bool], *, cancel: Callable[[], object] = lambda: None
-) -> None:
-    """Return once `reached()`; have the work ended by `cancel` when `cancelled()` turns true before.
+class Stop:
+    """Has a run of a schedule end early. Any thread may call."""
 
-    Raises
-    ------
-    ScanCancelledError
-        `cancelled()` became true.
-    """
-    while not reached():
-        if cancelled():
-            cancel()
-            message = "the run was cancelled"
-            raise ScanCancelledError(message)
-        time.sleep(LOOK_S)
+    def __init__(self) -> None:
+        self._news = threading.Event()
+        self._asked = False
+
+    def ask(self) -> None:
+        """Have the run end."""
+        self._asked = True
+        self._news.set()
+
+    def wait(
+        self, jobs: JobStore, followed: UUID, reached: Callable[[], bool], *, cancel: Callable[[], object]
+    ) -> None:
+        """Return once `reached()`, which may turn true with each event of a job or of those of a group. Once the run is
+        to end, `cancel` is called, and ScanCancelledError is raised.
+        """
+        unwatch = jobs.watch(followed, self._news.set)
+        try:
+            while not reached():
+                if self._asked:
+                    cancel()
+                    message = "the run was cancelled"
+                    raise ScanCancelledError(message)
+                self._news.wait()
+                self._news.clear()
+        finally:
+            unwatch()
 
 
 def error_of(fault: JobFailure) -> SlrigError:
@@ -74,22 +83,21 @@ class VerificationTask:
 
     options = VerificationOptions
 
-    def __init__(self, queue: JobQueue, calibrations: CalibrationSessions, desk: VerificationDesk) -> None:
-        self._queue = queue
+    def __init__(self, manager: JobManager, calibrations: Calibrations) -> None:
+        self._manager = manager
         self._calibrations = calibrations
-        self._desk = desk
 
     def check(self, asked: VerificationOptions, /) -> None:
         """See `Task`. A calibration may be made before the first run; a board to look at is named now or never."""
         self._board(asked)
         if asked.position is not None:
-            require_positions(self._queue.rig.facts, [asked.position])
+            require_positions(self._manager.rig.facts, [asked.position])
 
-    def do(self, holder: Holder, asked: VerificationOptions, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+    def do(self, holder: Holder, asked: VerificationOptions, /, *, stop: Stop) -> Mapping[str, Any]:
         """See `Task`. A rig that is found stale is a verification that succeeded."""
-        board, jobs = self._board(asked), self._desk.jobs
-        job = self._desk.shoot(board, position=asked.position, exposure_s=asked.exposure_s, holder=holder).id
-        until(lambda: jobs.get(job).state.final, cancelled, cancel=lambda: self._desk.cancel(job))
+        manager, jobs = self._manager, self._manager.store
+        job = manager.submit(VerificationJob(self._board(asked), asked.position, asked.exposure_s), holder=holder)[0].id
+        stop.wait(jobs, job, lambda: jobs.get(job).state.final, cancel=lambda: manager.cancel(job))
         over = jobs.get(job)
         if over.fault is not None:
             raise error_of(over.fault)
@@ -122,19 +130,19 @@ class CalibrationTask:
 
     options = CalibrationOptions
 
-    def __init__(self, queue: JobQueue, calibrations: CalibrationSessions, tidy: Callable[[], object]) -> None:
-        self._queue = queue
+    def __init__(self, manager: JobManager, calibrations: Calibrations, tidy: Callable[[], object]) -> None:
+        self._manager = manager
         self._calibrations = calibrations
         self._tidy = tidy
 
     def check(self, asked: CalibrationOptions, /) -> None:
         """See `Task`."""
         asked.board.board()
-        require_positions(self._queue.rig.facts, asked.positions)
+        require_positions(self._manager.rig.facts, asked.positions)
 
-    def do(self, holder: Holder, asked: CalibrationOptions, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+    def do(self, holder: Holder, asked: CalibrationOptions, /, *, stop: Stop) -> Mapping[str, Any]:
         """See `Task`. Poses that are refused are left out; one that fails ends the run."""
-        facts = self._queue.rig.facts
+        facts = self._manager.rig.facts
         require_positions(facts, asked.positions)
         first, *others = asked.positions or range(0 if facts is None else len(facts.positions))
         session = self._calibrations.open(asked.board.board(), label=holder.words).id
@@ -147,10 +155,10 @@ class CalibrationTask:
                 raise
             for position in others:
                 # Until the last pose was shot: it may still be read while the next one is.
-                self._await_poses(session, {JobState.QUEUED, JobState.CAPTURING}, cancelled)
+                self._await_poses(session, {JobState.QUEUED, JobState.CAPTURING}, stop)
                 self._shoot(session, holder, PoseRequest(position, asked.exposure_s), wait=True)
-            self._await_poses(session, {JobState.QUEUED, JobState.CAPTURING, JobState.COMPUTING}, cancelled)
-            return self._solved(session, asked, cancelled)
+            self._await_poses(session, {JobState.QUEUED, JobState.CAPTURING, JobState.COMPUTING}, stop)
+            return self._solved(session, asked, stop)
         except (DeviceError, WorkerLostError):
             # It is tried again from the first pose on. A pose that is being read yet leaves it to `tidy`.
             with suppress(CalibrationStateError, CalibrationNotFoundError):
@@ -160,24 +168,31 @@ class CalibrationTask:
             self._tidy()
 
     def _shoot(self, session: UUID, holder: Holder, request: PoseRequest, *, wait: bool) -> None:
-        self._calibrations.poses.shoot(session, request, wait=wait, holder=holder)
+        self._calibrations.shoot(session, request, wait=wait, holder=holder)
 
-    def _await_poses(self, session: UUID, pending: set[JobState], cancelled: Callable[[], bool]) -> None:
-        register, poses = self._calibrations.register, self._calibrations.poses
+    def _await_poses(self, session: UUID, pending: set[JobState], stop: Stop) -> None:
+        register = self._calibrations.register
 
         def cancel() -> None:
             for pose in register.get(session).poses:
-                poses.cancel(session, pose.number)
+                self._calibrations.cancel(session, pose.number)
 
-        until(lambda: not any(pose.state in pending for pose in register.get(session).poses), cancelled, cancel=cancel)
+        def shot() -> bool:
+            return not any(pose.state in pending for pose in register.get(session).poses)
+
+        stop.wait(self._manager.store, session, shot, cancel=cancel)
         for pose in register.get(session).poses:
             if pose.fault is not None and not pose.refused:
                 raise error_of(pose.fault)
 
-    def _solved(self, session: UUID, asked: CalibrationOptions, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+    def _solved(self, session: UUID, asked: CalibrationOptions, stop: Stop) -> Mapping[str, Any]:
         register = self._calibrations.register
-        self._calibrations.solves.solve(session)
-        until(lambda: register.get(session).state is not SessionState.SOLVING, cancelled)
+        self._calibrations.solve(session)
+
+        def solved() -> bool:
+            return register.get(session).state is not SessionState.SOLVING
+
+        stop.wait(self._manager.store, session, solved, cancel=lambda: None)
         record = register.get(session)
         if record.fault is not None:
             raise error_of(record.fault)
@@ -205,33 +220,35 @@ class CalibrationTask:
 
 
 class AcceptanceTask:
-    """Every prescribed position measured by the rig's positioner, and the decision. The rig is held for the whole."""
+    """Every prescribed position measured by the rig's positioner, and the decision."""
 
     options = AcceptanceRequest
 
-    def __init__(self, queue: JobQueue, desk: AcceptanceDesk) -> None:
-        self._queue = queue
-        self._desk = desk
+    def __init__(self, manager: JobManager, tests: AcceptanceTests) -> None:
+        self._manager = manager
+        self._tests = tests
 
     def check(self, _asked: AcceptanceRequest, /) -> None:
         """See `Task`."""
-        require_positions(self._queue.rig.facts, ())
+        require_positions(self._manager.rig.facts, ())
 
-    def do(self, holder: Holder, asked: AcceptanceRequest, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+    def do(self, holder: Holder, asked: AcceptanceRequest, /, *, stop: Stop) -> Mapping[str, Any]:
         """See `Task`. A rig that fails the test is a run that succeeded."""
-        desk = self._desk
-        test = desk.open(asked.plan).id
+        tests = self._tests
+        test = tests.open(asked.plan).id
         try:
-            desk.measure(test, wait=False, scripted=True, holder=holder)
+            tests.measure(test, wait=False, scripted=True, holder=holder)
         except BaseException:
-            desk.cancel(test)
+            tests.cancel(test)
             raise
-        until(
-            lambda: desk.get(test).state is not AcceptanceState.MEASURING, cancelled, cancel=lambda: desk.cancel(test)
-        )
-        record = desk.get(test)
+
+        def measured() -> bool:
+            return tests.get(test).state is not AcceptanceState.MEASURING
+
+        stop.wait(self._manager.store, test, measured, cancel=lambda: tests.cancel(test))
+        record = tests.get(test)
         if record.decision is None:
-            desk.cancel(test)
+            tests.cancel(test)
             raise error_of(record.fault or job_failure(RuntimeError("the test ended without a result")))
         return {
             "acceptance": str(test),

@@ -32,9 +32,8 @@ _LEAST_WAIT_S = 0.05
 _log = structlog.get_logger(__name__)
 
 
-Work = Callable[[Schedule, ScheduledRun, Callable[[], bool]], Mapping[str, Any]]
-"""Does what a schedule asks for, on a thread of the scheduler's, until the call that it is given says that it is
-cancelled. Returns what there is to tell.
+Work = Callable[[Schedule, ScheduledRun], Mapping[str, Any]]
+"""Does what a schedule asks for, on a thread of the scheduler's. Returns what is on record of it.
 
 Raises RigBusyError where somebody holds the rig, before anything was done; SlrigError where it could not be done: what
 may pass, see `passes`, has the run try again within its grace.
@@ -92,10 +91,14 @@ class Scheduler:
         """Look at the clock now: a schedule was changed, or the rig became free."""
         self._wanted.set()
 
-    def close(self, *, timeout_s: float = 3.0) -> None:
-        """Stop. A run under way is asked to end, and recorded as interrupted if it does not in time. Idempotent."""
+    def stop(self) -> None:
+        """Begin no further run, and take one that ends from now on for interrupted. Idempotent."""
         self._stop.set()
         self.wake()
+
+    def close(self, *, timeout_s: float = 3.0) -> None:
+        """Stop. A run under way is recorded as interrupted if it does not end in time. Idempotent."""
+        self.stop()
         if self._loop.is_alive():
             self._loop.join(timeout_s)
         self._idle.wait(timeout_s)
@@ -138,7 +141,7 @@ class Scheduler:
         state, reason, result = RunState.FAILED, None, None
         cut_off = False
         try:
-            result = self._work(schedule, run, self._stop.is_set)
+            result = self._work(schedule, run)
             state = RunState.SUCCEEDED
             reason = f"at try {run.attempts + 1}" if run.attempts else run.reason
         except SlrigError as error:

@@ -5,19 +5,17 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
-from uuid import UUID, uuid4
+from uuid import UUID
 
-from slrig.accept.desk import AcceptanceDesk
+from slrig.accept.job import AcceptanceTests
 from slrig.bundle import Strict
-from slrig.calibrate.calibrating import CalibrationSessions
+from slrig.calibrate.calibrating import Calibrations
 from slrig.errors import CalibrationError, ScanStateError, ScheduleError
-from slrig.jobs.job import Holder, Job
-from slrig.jobs.queue import JobQueue
-from slrig.jobs.records import utc_now
+from slrig.jobs.manager import JobManager
+from slrig.jobs.records import Holder
 from slrig.schedule.records import Schedule, ScheduledRun, ScheduleSpec, TaskKind
-from slrig.schedule.rig_tasks import AcceptanceTask, CalibrationTask, VerificationTask, until
+from slrig.schedule.rig_tasks import AcceptanceTask, CalibrationTask, Stop, VerificationTask
 from slrig.schedule.task_options import checked
-from slrig.verify.job import VerificationDesk
 
 
 class ScheduledTask(Protocol):
@@ -30,8 +28,8 @@ class ScheduledTask(Protocol):
         """Raise ScheduleError or CalibrationError for options that no run could be done with, as far as is known."""
         ...
 
-    def do(self, holder: Holder, asked: Any, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
-        """Do it, the rig held by `holder`, and return what there is to tell, as JSON values.
+    def do(self, holder: Holder, asked: Any, /, *, stop: Stop) -> Mapping[str, Any]:
+        """Do it, the rig held by `holder`, and return what is on record of it, as JSON values.
 
         Raises
         ------
@@ -51,21 +49,20 @@ class Tasks:
 
     def __init__(
         self,
-        queue: JobQueue,
-        calibrations: CalibrationSessions,
-        verifications: VerificationDesk,
-        acceptance: AcceptanceDesk,
+        manager: JobManager,
+        calibrations: Calibrations,
+        acceptance: AcceptanceTests,
         *,
         tidy: Callable[[], object] = lambda: None,
     ) -> None:
-        self._queue = queue
+        self._manager = manager
         self._of: Mapping[TaskKind, ScheduledTask] = {
-            TaskKind.VERIFICATION: VerificationTask(queue, calibrations, verifications),
-            TaskKind.CALIBRATION: CalibrationTask(queue, calibrations, tidy),
-            TaskKind.ACCEPTANCE: AcceptanceTask(queue, acceptance),
+            TaskKind.VERIFICATION: VerificationTask(manager, calibrations),
+            TaskKind.CALIBRATION: CalibrationTask(manager, calibrations, tidy),
+            TaskKind.ACCEPTANCE: AcceptanceTask(manager, acceptance),
         }
         self._lock = threading.Lock()
-        self._stops: dict[UUID, threading.Event] = {}
+        self._stops: dict[UUID, Stop] = {}
 
     def check(self, order: ScheduleSpec) -> None:
         """Raise ScheduleError, with every fault, for options that no run could be done with."""
@@ -76,22 +73,27 @@ class Tasks:
             message = f"options: {error}"
             raise ScheduleError(message) from error
 
-    def __call__(self, schedule: Schedule, run: ScheduledRun, cancelled: Callable[[], bool], /) -> Mapping[str, Any]:
+    def __call__(self, schedule: Schedule, run: ScheduledRun, /) -> Mapping[str, Any]:
         """See `slrig.schedule.scheduler.Work`."""
-        order, stop = schedule.order, threading.Event()
+        order, stop = schedule.order, Stop()
         task, holder = self._of[order.task], holder_of(schedule, run)
-
-        def ends() -> bool:
-            return cancelled() or stop.is_set()
-
         with self._lock:
             self._stops[schedule.id] = stop
         try:
-            self._open_rig(holder, ends)
-            return task.do(holder, checked(task.options, order.options, task=order.task), cancelled=ends)
+            if self._manager.rig.facts is None:
+                # What it can do is known only when it is open.
+                self._manager.lend(holder, lambda _rig, _cancelled: None)
+            return task.do(holder, checked(task.options, order.options, task=order.task), stop=stop)
         finally:
             with self._lock:
                 self._stops.pop(schedule.id, None)
+
+    def end(self) -> None:
+        """Have every run end: the service ends."""
+        with self._lock:
+            stops = list(self._stops.values())
+        for stop in stops:
+            stop.ask()
 
     def cancel(self, schedule: Schedule) -> None:
         """Ask the run of a schedule that is under way to end early. Returns at once. Raises ScanStateError."""
@@ -100,18 +102,7 @@ class Tasks:
         if stop is None:
             message = f"Schedule {schedule.id} has no run under way. GET /schedule/{schedule.id}/runs lists its runs."
             raise ScanStateError(message)
-        stop.set()
-
-    def _open_rig(self, holder: Holder, cancelled: Callable[[], bool]) -> None:
-        """Have a rig opened that was not open yet: what it can do is known only then. Raises as a scan does."""
-        if self._queue.rig.facts is not None:
-            return
-        errors: list[Exception | None] = []
-        job = Job(uuid4(), holder, utc_now(), lambda rig, _: rig.open(), errors.append)
-        self._queue.submit(lambda: [job], wait=False)
-        until(lambda: bool(errors), cancelled, cancel=lambda: self._queue.cancel(job.id))
-        if errors[0] is not None:
-            raise errors[0]
+        stop.ask()
 
 
 def holder_of(schedule: Schedule, run: ScheduledRun) -> Holder:

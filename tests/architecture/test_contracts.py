@@ -52,7 +52,8 @@ ROOMS = (
 PUBLIC_MODULES = {
     # These load OpenCV or compiled kernels, which code that only names boards and calibrations must not.
     *(f"slrig.calibration.{name}" for name in ("accuracy", "judgement", "printing")),
-    *(f"slrig.calibration.{name}" for name in ("detection", "health", "health.drift", "poses", "solving")),
+    *(f"slrig.calibration.{name}" for name in ("detection", "health", "health.drift", "health.verification")),
+    *(f"slrig.calibration.{name}" for name in ("poses", "solving")),
     # The rendered rig must not import slrig's lens: a contract names these two modules.
     "slrig.model.lens", "slrig.model.lens_kernels",
 }  # fmt: skip

@@ -25,8 +25,10 @@ from slrig import KEY_VARIABLE
 from slrig.api import server
 from slrig.config import ServiceSettings, parse_rig
 from slrig.jobs import worker_process
+from slrig.jobs.worker import Worker
 from tests.e2e.conftest import Start, ended
 from tests.unit.api.conftest import ServedBench
+from tests.unit.scan.bench import PIPELINE
 
 KEY = "Zm9vYmFy-_x0.key~of+the/tests"
 LIBRARIES = ("sqlalchemy.pool", "alembic.runtime.migration", "sse_starlette.sse", "uvicorn.error", "asyncio")
@@ -68,21 +70,23 @@ class Server(server._Server):
         await asyncio.to_thread(speak)
 
 
-def _called(task: worker_process.Task, given: dict[str, Any]) -> Any:
+def _answered(
+    pipe: Any, stops: Any, run: worker_process.RunTask, pipeline: Any, live: Any
+) -> worker_process.Done | worker_process.Failed:
     structlog.get_logger("worker").warning("said by the worker")
     speak()
-    return _call(task, given)
+    return _answer(pipe, stops, run, pipeline, live)
 
 
-_call = worker_process._called
+_answer = worker_process._answer
 if __name__ == "__mp_main__":
     # In the worker, which loads the main module of its parent under this name.
-    worker_process._called = _called
+    worker_process._answer = _answered
 
 
 def main(data: Path) -> None:
     """Serve from a data folder until SIGTERM, and end by an error that is not caught."""
-    bench = ServedBench(data)
+    bench = ServedBench(data, worker=Worker(PIPELINE))
     bench.gate.set()
     server._Server = Server  # type: ignore[misc] # `serve` makes one of these
     server.open_service = lambda *_, **__: bench.service
@@ -111,7 +115,7 @@ def test_all_lines_have_one_form(start: Start, tmp_path: Path) -> None:
     assert all({"event", "level", "logger", "timestamp"} <= set(line) for line in lines)
     assert all(isinstance(line["event"], str) and line["timestamp"].endswith("Z") for line in lines)
     loggers = {line["logger"] for line in lines}
-    assert loggers >= {*LIBRARIES, "py.warnings", "slrig.logs", "slrig.jobs.endings", "worker"}
+    assert loggers >= {*LIBRARIES, "py.warnings", "slrig.logs", "slrig.jobs.manager", "worker"}
     events = [line["event"] for line in lines]
     assert "Invalid HTTP request received." in events
     assert any("a library will change" in event for event in events)

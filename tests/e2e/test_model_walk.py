@@ -15,10 +15,10 @@ from slrig.bundle.options import read_poses
 from slrig.client import Client
 from slrig.client.errors import ConflictError, ModelFailedError
 from slrig.combine.offered import MEDIA_TYPES
-from slrig.jobs.records import utc_now
+from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, utc_now, write_record
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply
 from slrig.scan.plan import ScanPlan
-from slrig.scan.records import KeptRecord, write_record
+from slrig.scan.records import plan_json
 from tests.e2e.conftest import Start, write_rig
 from tests.turned_views import AXIS, AXIS_POINT_MM, bumpy, displacement_mm, off_surface_mm, seen
 
@@ -37,7 +37,14 @@ def on_a_turntable(data: Path) -> tuple[list[str], list[np.ndarray]]:
         (folder / "report.json").write_text(
             json.dumps({"format": "slrig-report", "turntable": {"angle_deg": angle, "turned_by": "table"}})
         )
-        write_record(folder, KeptRecord(scan_id, "small", None, ScanPlan(), utc_now(), utc_now()))
+        now, plan = utc_now(), plan_json(ScanPlan())
+        progress = JobProgress("", 0.0, "")
+        write_record(
+            folder,
+            JobRecord(
+                0, scan_id, JobKind.SCAN, JobState.SUCCEEDED, None, "small", plan, now, now, now, progress, None, {}
+            ),
+        )
         scans.append(str(scan_id))
     return scans, turned.poses
 

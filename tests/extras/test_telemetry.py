@@ -76,10 +76,10 @@ def attributes(span: Any) -> dict[str, str]:
 
 def test_job_is_a_trace_with_a_span_for_each_stage(collector: Collector, tmp_path: Path) -> None:
     start = now = datetime(2026, 11, 20, 6, tzinfo=UTC)
-    store = JobStore(Database(tmp_path / "slrig.sqlite"), JobKind.POSE, JobKind.SOLVE, clock=lambda: now)
+    store = JobStore(Database(tmp_path / "slrig.sqlite"), clock=lambda: now)
     traces = traces_by_environment()
     assert traces is not None
-    job = store.create({}, rig="bench", label=None).id
+    job = store.create({}, kind=JobKind.POSE, rig="bench", label=None).id
     for seconds, state in ((2, JobState.CAPTURING), (5, JobState.COMPUTING)):
         now += timedelta(seconds=seconds)
         store.advance(job, state)

@@ -16,6 +16,7 @@ import pytest
 from slrig.bundle import Bundle, read_bundle
 from slrig.calibrate.pose_reading import read_pose
 from slrig.calibrate.solving import solve_poses
+from slrig.calibrate.verification import verify_bundle
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.health import HealthState, judge_health
 from slrig.calibration.solution import PROJECTOR
@@ -23,7 +24,6 @@ from slrig.capture.verifier import check_capture
 from slrig.model import Axis, Calibration, Capture, LineShift, Size
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ScanPlan
-from slrig.verify.verification import verify_bundle
 from tests.bench.test_calibration_seeds import rig_options
 from tests.rendered_boards import board_head, board_options, board_rig, board_scene, rendered_poses
 

@@ -13,6 +13,6 @@ from tests.unit.scan.bench import Bench
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:
     bench = Bench(tmp_path)
-    bench.runner.start()
+    bench.manager.start()
     yield bench
     bench.close()

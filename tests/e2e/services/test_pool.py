@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -22,12 +23,12 @@ import pytest
 
 from slrig.jobs.compute import Compute
 from slrig.jobs.worker import Worker
-from slrig.scan.job import PIPELINE, reconstruction
-from slrig.scan.plan import ReconstructionPlan
+from slrig.scan.job import PIPELINE
 from tests.e2e.conftest import Start, write_rig
 from tests.listening import free_port, listening_at
 from tests.npm import lacking
 from tests.unit.command import done
+from tests.unit.scan.fakes import reconstruction
 
 if TYPE_CHECKING:
     from slrig.compute.cluster import DaskCluster
@@ -209,7 +210,7 @@ class Rig:
 
     def computed(self, result: Path, *, when_begun: Callable[[], None]) -> dict[str, Any]:
         """Reconstruct, with something done in the middle; return the report's section."""
-        result.mkdir()
+        shutil.copytree(self.bundle, result / "bundle")
         begun = False
 
         def progress(_stage: str, fraction: float, _detail: str) -> None:
@@ -218,10 +219,9 @@ class Rig:
                 begun = True
                 when_begun()
 
-        task = reconstruction(PIPELINE, self.bundle, result, ReconstructionPlan())
-        report = self.worker.run(task, progress=progress)
+        self.worker.run(reconstruction(result), progress=progress)
         assert begun
-        assert report == json.loads((result / "report.json").read_text())
+        report = json.loads((result / "result" / "report.json").read_text())
         section: dict[str, Any] = report["computed"]
         return section
 
@@ -246,17 +246,17 @@ def test_whatever_is_lost_a_scan_has_its_one_result(
     rig = Rig(pool, bundle, local)
     assert rig.cluster.usable(30)
     try:
-        alone = tmp_path / "alone"
-        alone.mkdir()
-        assert local.run(reconstruction(PIPELINE, bundle, alone, ReconstructionPlan()))["computed"]["where"] == "local"
+        shutil.copytree(bundle, tmp_path / "alone" / "bundle")
+        alone = tmp_path / "alone" / "result"
+        assert local.run(reconstruction(alone.parent)).summary["computed"]["where"] == "local"
         whole = {path.name for path in alone.iterdir()}
         assert (alone / "mesh.ply").read_bytes() == pooled.read_bytes()
         assert whole <= names
 
         def right(case: str, when_begun: Callable[[], None]) -> dict[str, Any]:
             section = rig.computed(tmp_path / case, when_begun=when_begun)
-            assert {path.name for path in (tmp_path / case).iterdir()} == whole
-            assert (tmp_path / case / "mesh.ply").read_bytes() == pooled.read_bytes()
+            assert {path.name for path in (tmp_path / case / "result").iterdir()} == whole
+            assert (tmp_path / case / "result" / "mesh.ply").read_bytes() == pooled.read_bytes()
             return section
 
         def kill_who_computes() -> None:

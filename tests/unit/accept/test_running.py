@@ -198,7 +198,7 @@ def take_scans_from(monkeypatch: pytest.MonkeyPatch, plan: AcceptancePlan, scan:
     """Have every capture of a plan's step be reconstructed as `scan` says."""
 
     def reconstruct(bundle: Path, output: Path, /, **_: object) -> Mapping[str, Any]:
-        name = bundle.parent.name.lstrip(".").rsplit("-", 1)[0]
+        name = bundle.name.rsplit("-", 1)[0]
         output.mkdir()
         step = next(step for step in plan.steps if step.name == name)
         (output / "mesh.ply").write_bytes(encode_mesh_ply(scan(step)))
@@ -260,7 +260,7 @@ def test_a_run_measures_every_position_and_writes_what_it_found(
     used = kept["points_mm"][kept["artefact"] == 1].astype(np.float64)
     radial = np.linalg.norm(used - SHORT.steps[0].centre_mm, axis=1)
     assert 2 * radial.mean() - 30 == pytest.approx(capture["errors_mm"]["PS"], abs=0.001)
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"points", "report.json", "report.html"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"positions", "report.json", "report.html"}
 
 
 def test_the_page_holds_everything_and_says_what_it_is_not(
@@ -306,8 +306,8 @@ def test_a_cancelled_test_keeps_its_points_and_writes_no_report(
     answers = iter([False, True])
     with pytest.raises(ScanCancelledError, match="cancelled before"):
         run(SHORT, cancelled=lambda: next(answers))
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["points"]
-    assert [path.name for path in (tmp_path / "out" / "points").iterdir()] == ["sphere-1-1.npz"]
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["positions"]
+    assert [path.name for path in (tmp_path / "out" / "positions" / "sphere-1").iterdir()] == ["1.npz"]
 
 
 def test_an_artefact_that_was_not_found_is_placed_again(run: Callable[..., AcceptanceResult]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -13,30 +14,34 @@ from fastapi.testclient import TestClient
 from slrig.api.app import create_app
 from slrig.api.keys import KeyRing
 from slrig.api.problems import install_problems
+from slrig.api.server import KINDS
 from slrig.api.service import Service, _of_request
 from slrig.bundle.options import ScanDefaults
 from slrig.config import ServiceSettings
+from slrig.jobs.compute import Compute
 from slrig.jobs.copies import Copies
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
+from slrig.jobs.manager import JobManager
 from slrig.jobs.outbox import Outbox
-from slrig.jobs.records import JobKind, JobState
+from slrig.jobs.records import JobState
 from slrig.jobs.store import JobStore
-from slrig.jobs.worker import Worker
 from slrig.rig.session import RigSession
-from slrig.scan.runner import Runner
 from tests.unit.calibrate.calibration_bench import TameCalibrating
 from tests.unit.combine.model_bench import TameCombining
+from tests.unit.jobs.tame_compute import TameCompute
+from tests.unit.scan.bench import PIPELINE
 from tests.unit.scan.fakes import WAIT_S, TameBench
+from tests.unit.stand_ins import stand_ins
 
 KEY = "the key of the tests"
 HERE = "http://127.0.0.1"
 
 
 class ServedBench(TameBench):
-    """A service over a tame bench."""
+    """A service over a tame bench. worker : what computes, for one that needs no process."""
 
-    def __init__(self, root: Path, **settings: Any) -> None:
+    def __init__(self, root: Path, *, worker: Compute | None = None, **settings: Any) -> None:
         super().__init__()
         self.free_bytes = 10**12
         chosen = ServiceSettings(
@@ -45,26 +50,21 @@ class ServedBench(TameBench):
         folder = DataFolder(root, free=lambda _: self.free_bytes)
         database = Database(folder.database)
         copies = Copies(database) if "catalogue" in settings else None
-        store = JobStore(database, JobKind.SCAN, outbox=Outbox(database, copies=copies))
-        self.worker = Worker("tests.unit.scan.fake_pipeline")
+        store = JobStore(database, outbox=Outbox(database, copies=copies))
+        self.worker = TameCompute(PIPELINE) if worker is None else worker
+        self.tame, self.combining = TameCalibrating(), TameCombining()
+        patched = ExitStack()
+        functions = {
+            "combine.combining.combine_into": self.combining,
+            # The fake reconstruction reports no residuals: each scan would log the traceback of a defect.
+            "calibrate.verification.RigHealth._note_scan": lambda *_: None,
+        }
+        for each in (self.captures(), self.tame.patched(), stand_ins(functions)):
+            patched.enter_context(each)
+        self.unpatch = patched.close
         rig = RigSession("bench", self.open_rig)
-        runner = Runner(store, folder, rig, self.worker, capture=self.capture, queue_length=1)
-        defaults = ScanDefaults(line_shift_period_px=6, exposure_s=0.5)
-        self.tame = TameCalibrating(self)
-        self.combining = TameCombining()
-        self.service = Service(
-            chosen,
-            defaults,
-            folder,
-            store,
-            runner,
-            self.worker,
-            rig_name="bench",
-            calibration_tools=self.tame.tools(),
-            combine=self.combining,
-        )
-        # The fake reconstruction reports no residuals: each scan would log the traceback of a defect.
-        self.service.verifications.note = lambda report: None  # type: ignore[method-assign] # noqa: ARG005
+        manager = JobManager(store, folder, rig, self.worker, *KINDS, queue_length=1)
+        self.service = Service(chosen, ScanDefaults(line_shift_period_px=6, exposure_s=0.5), manager)
         self.app: FastAPI = create_app(self.service, ring=KeyRing(root / "keys.json", given=KEY))
 
     def held(self, client: TestClient) -> dict[str, Any]:
@@ -76,8 +76,10 @@ class ServedBench(TameBench):
 
 
 @pytest.fixture(scope="package")
-def served(tmp_path_factory: pytest.TempPathFactory) -> ServedBench:
-    return ServedBench(tmp_path_factory.mktemp("data"))
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServedBench]:
+    served = ServedBench(tmp_path_factory.mktemp("data"))
+    yield served
+    served.unpatch()
 
 
 @pytest.fixture(scope="package")

@@ -161,7 +161,7 @@ def test_cameras_may_be_calibrated_without_the_projector(calibrating: TestClient
     assert made["patterns"]["codes"] is False
     assert shot(calibrating, made["id"])["accepted"] is True
     assert set(calibrating.get(made["links"]["self"]).json()["links"]["coverage"]) == {"cam0"}
-    _, plan = served.tame.captured[-1]
+    _, plan, _ = served.captured[-1]
     assert {str(each.kind) for each in pattern_sequence(plan.patterns, Size(64, 40)).patterns} == {"white", "black"}
 
 

@@ -56,7 +56,7 @@ def test_model_is_made_once_followed_and_fetched(client: TestClient, served: Ser
     assert set(done["links"]["files"]) == set(MEDIA_TYPES)
     for name, path in done["links"]["files"].items():
         found = client.get(path)
-        assert found.content == (served.service.models.store.place(UUID(model["id"])) / name).read_bytes()
+        assert found.content == (served.service.models.place(UUID(model["id"])) / name).read_bytes()
         assert found.headers["content-type"].startswith(MEDIA_TYPES[name])
         assert client.get(path, headers={"If-None-Match": found.headers["ETag"]}).status_code == 304
     for scan in scans:

@@ -13,50 +13,53 @@ import pytest
 from fastapi.testclient import TestClient
 
 from slrig.accept.asking import AcceptanceRequest
-from slrig.accept.desk import AcceptanceDesk
 from slrig.api import acceptance as router_module
 from slrig.api import health, turntable
 from slrig.calibrate.records import PoseRecord, SessionRecord
+from slrig.calibrate.verification import HealthStore
 from slrig.calibration.board import DEFAULT_BOARD
 from slrig.combine.turntable import TurntableStore
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.keys import RequestKeys
-from slrig.jobs.records import JobKind, JobState
-from slrig.jobs.store import JobStore
+from slrig.jobs.records import JobState
 from slrig.multiview.turntable import BoardAxis, axis_from_board, find_turntable_planes
-from slrig.verify.job import VerificationDesk
-from slrig.verify.store import HealthStore
-from tests.unit.accept.test_desk import PLAN, desk, desks, queue
+from tests.unit.accept.test_job import PLAN, Desk, desk, desks
 from tests.unit.api.conftest import app_of, refusal
-from tests.unit.jobs.tame_queue import TameQueue
+from tests.unit.calibrate.test_verification import Verifying, tame
+from tests.unit.jobs.tame_compute import TameCompute
 from tests.unit.multiview.test_turntable_axis import SIX_DEG, shot
 from tests.unit.multiview.test_turntable_planes import AXIS, PLATE
-from tests.unit.verify.test_verification import TAME, queue_of
+from tests.unit.scan.bench import PIPELINE
 
-__all__ = ["desk", "desks", "queue"]
+__all__ = ["desk", "desks", "tame"]
 
 BOARD = {"kind": "chessboard", "corners": [11, 8], "square_mm": 12.0}
 
 
 @pytest.fixture
-def verifying() -> TameQueue:
-    return queue_of()
+def folder(tmp_path: Path) -> Iterator[DataFolder]:
+    folder = DataFolder(tmp_path / "data")
+    yield folder
+    folder.release()
 
 
 @pytest.fixture
-def health_client(tmp_path: Path, verifying: TameQueue) -> Iterator[TestClient]:
-    folder = DataFolder(tmp_path / "data")
+def verifying(folder: DataFolder) -> Iterator[Verifying]:
     store = HealthStore(Database(folder.database))
-    desk = VerificationDesk(folder, verifying, store, JobStore(store.database, JobKind.VERIFICATION), tools=TAME)
+    yield Verifying(folder, store)
+    store.database.close()
+
+
+@pytest.fixture
+def health_client(folder: DataFolder, verifying: Verifying) -> Iterator[TestClient]:
+    manager = verifying.manager
     service = SimpleNamespace(
-        folder=folder, verifications=desk, keys=RequestKeys(store.database), refuse_when_stale=True,
-        calibrations=SimpleNamespace(active=None),
+        folder=folder, manager=manager, store=manager.store, health=verifying.health,
+        keys=RequestKeys(manager.store.database), refuse_when_stale=True, calibrations=SimpleNamespace(active=None),
     )  # fmt: skip
     with TestClient(app_of(health.router, service)) as found:
         yield found
-    store.database.close()
-    folder.release()
 
 
 def test_a_verification_changes_the_health(health_client: TestClient) -> None:
@@ -90,8 +93,8 @@ def test_a_verification_changes_the_health(health_client: TestClient) -> None:
     assert "Expected error of a scan" in plot.text
 
 
-def test_a_busy_rig_names_its_holder(health_client: TestClient, verifying: TameQueue) -> None:
-    verifying.busy = "schedule 'nightly'"
+def test_a_busy_rig_names_its_holder(health_client: TestClient, verifying: Verifying) -> None:
+    verifying.manager.busy = "schedule 'nightly'"
     answer = health_client.post("/rig/verification", json={"board": BOARD})
     assert answer.status_code == 409
     assert "schedule 'nightly'" in answer.json()["detail"]
@@ -119,7 +122,7 @@ def found(observed: list[int], _board: object, _calibration: object, angles_deg:
 
 
 @pytest.fixture
-def turntable_client(tmp_path: Path) -> Iterator[TestClient]:
+def turntable_client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TestClient]:
     folder = DataFolder(tmp_path / "data")
     folder.scan(SCAN).mkdir(parents=True)
     (folder.scan(SCAN) / "mesh.ply").write_bytes(b"of the empty turntable")
@@ -129,13 +132,15 @@ def turntable_client(tmp_path: Path) -> Iterator[TestClient]:
         folder=folder,
         turntable=TurntableStore(folder.root / "turntable"),
         calibrations=SimpleNamespace(
-            register=SimpleNamespace(get=lambda _: session), store=SimpleNamespace(readings=lambda _: readings)
+            register=SimpleNamespace(get=lambda _: session), store=SimpleNamespace(folder=lambda _: tmp_path)
         ),
-        verifications=SimpleNamespace(health=lambda: (None, None, "the calibration in use")),
-        store=SimpleNamespace(get=lambda _: SimpleNamespace(state=JobState.SUCCEEDED)),
-        find_axis=found,
-        find_planes=lambda _mesh, _axis: find_turntable_planes(PLATE, AXIS),
+        health=SimpleNamespace(health=lambda: (None, None, "the calibration in use")),
+        store=SimpleNamespace(get=lambda *_: SimpleNamespace(state=JobState.SUCCEEDED)),
+        worker=TameCompute(PIPELINE),
     )
+    monkeypatch.setattr(turntable, "session_readings", lambda _: readings)
+    monkeypatch.setattr(turntable, "turntable_axis", found)
+    monkeypatch.setattr(turntable, "turntable_planes", lambda *_: find_turntable_planes(PLATE, AXIS))
     with TestClient(app_of(turntable.router, service)) as made:
         yield made
     folder.release()
@@ -195,14 +200,14 @@ VOLUME = [[-100, -75, -40], [100, 75, 40]]
 
 
 @pytest.fixture
-def acceptance_client(desk: AcceptanceDesk) -> TestClient:
-    keys, folder = RequestKeys(desk.jobs.database), SimpleNamespace(require_present=lambda: None)
-    service = SimpleNamespace(acceptance=desk, keys=keys, folder=folder)
+def acceptance_client(desk: Desk) -> TestClient:
+    store, folder = desk.manager.store, SimpleNamespace(require_present=lambda: None)
+    service = SimpleNamespace(acceptance=desk, store=store, keys=RequestKeys(store.database), folder=folder)
     return TestClient(app_of(router_module.router, service))
 
 
 def test_positions_are_measured_to_the_end_and_the_report_is_fetched(
-    acceptance_client: TestClient, desk: AcceptanceDesk, tmp_path: Path
+    acceptance_client: TestClient, desk: Desk, tmp_path: Path
 ) -> None:
     answer = acceptance_client.post("/acceptance", json={"artefacts": EXACT, "volume_mm": VOLUME, "repeats": 2})
     body = answer.json()
@@ -225,7 +230,7 @@ def test_positions_are_measured_to_the_end_and_the_report_is_fetched(
     first, second = acceptance_client.get("/acceptance").json()["tests"]
     assert (first["id"], first["decision"], second["decision"]) == (str(test.id), "passes", None)
     assert acceptance_client.get("/acceptance?limit=1").json()["tests"] == [first]
-    assert (tmp_path / "acceptance" / str(test.id) / "points").is_dir()
+    assert (tmp_path / "acceptance" / str(test.id) / "positions").is_dir()
     assert acceptance_client.delete(path).status_code == 204
     assert acceptance_client.get(path).status_code == 404
 
@@ -246,11 +251,9 @@ def test_bad_request_for_a_test_is_refused(acceptance_client: TestClient, body: 
     assert words in answer.text
 
 
-def test_held_rig_answers_409_and_an_unknown_test_404(
-    acceptance_client: TestClient, desk: AcceptanceDesk, queue: TameQueue
-) -> None:
+def test_held_rig_answers_409_and_an_unknown_test_404(acceptance_client: TestClient, desk: Desk) -> None:
     test = desk.open(lambda *_: PLAN)
-    queue.busy = "1"
+    desk.manager.busy = "1"
     answer = acceptance_client.post(f"/acceptance/{test.id}/position")
     assert (answer.status_code, answer.json()["holder"]) == (409, "1")
     assert acceptance_client.get("/acceptance/00000000-0000-0000-0000-000000000000").status_code == 404
@@ -258,7 +261,7 @@ def test_held_rig_answers_409_and_an_unknown_test_404(
 
 
 def test_repeated_request_opens_and_measures_nothing_new(
-    acceptance_client: TestClient, desk: AcceptanceDesk, queue: TameQueue, monkeypatch: pytest.MonkeyPatch
+    acceptance_client: TestClient, desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(AcceptanceRequest, "plan", lambda *_: PLAN)
     key = {"Idempotency-Key": "once"}
@@ -269,7 +272,7 @@ def test_repeated_request_opens_and_measures_nothing_new(
     again = acceptance_client.post("/acceptance", headers=key)
     assert (again.status_code, again.headers["location"], again.json()) == (201, path, first.json())
     assert acceptance_client.post(f"{path}/position", headers=key).json() == acceptance_client.get(path).json()
-    assert (len(queue.holders), len(desk.latest())) == (1, 1)
+    assert (len(desk.manager.holders), len(desk.latest())) == (1, 1)
     for where in ("/acceptance", f"{path}/position"):
         other = {"repeats": 2} if where == "/acceptance" else {"scripted": True}
         assert refusal(acceptance_client, "POST", where, headers=key, json=other) == (422, "/problems/idempotency")

@@ -20,6 +20,7 @@ from slrig.bundle.calibration import write_calibration
 from slrig.cli.options import ServiceOptions
 from slrig.client import Client
 from slrig.schedule.records import RunState
+from slrig.schedule.rig_tasks import Stop
 from tests.unit import command
 from tests.unit.api.conftest import KEY, ServedBench, refusal
 from tests.unit.command import refused, slrig
@@ -248,11 +249,11 @@ def test_command_pauses_resumes_cancels_and_removes(
     assert done("pause", beginning) == "paused\n"
     assert f"{made['id']}: verification at '0 2 * * *' in UTC\n" in done("resume", beginning)
     assert "has no run under way" in refused(run("cancel", beginning))
-    stopped = threading.Event()
+    stop = Stop()
     # As a run under way leaves it there.
-    monkeypatch.setitem(served.service.tasks._stops, UUID(made["id"]), stopped)
+    monkeypatch.setitem(served.service.tasks._stops, UUID(made["id"]), stop)
     assert done("cancel", beginning) == "the run was asked to end\n"
-    assert stopped.is_set()
+    assert stop._asked
     assert kept(client) == [made]
     assert f"there are: {beginning}" in refused(run("pause", "zzz"))
     assert done("remove", beginning) == "removed\n"

@@ -34,7 +34,6 @@ from slrig.api.events import Followed, OpenStreams, followed_feed, followed_job
 from slrig.api.events import told as stream_of
 from slrig.failure import JobFailure
 from slrig.jobs.database import Database
-from slrig.jobs.feed import JobFeed
 from slrig.jobs.records import JobEvent, JobKind, JobProgress, JobState
 from slrig.jobs.store import EVERY_JOB, JobStore
 from tests.unit.api.conftest import KEY, ServedBench
@@ -55,18 +54,16 @@ class ActingStore(JobStore):
 
 
 class Jobs:
-    """Scans and poses of one database, and the feed of both. `looks` : after which number each look was."""
+    """The jobs of one database. `looks` : after which number each look was."""
 
     def __init__(self, folder: Path) -> None:
         database = Database(folder / "slrig.sqlite")
-        self.scans = ActingStore(database, JobKind.SCAN)
-        self.poses = JobStore(database, JobKind.POSE, JobKind.SOLVE)
-        self.feed = JobFeed(self.scans, self.poses)
+        self.store = ActingStore(database)
         self.streams = OpenStreams(99)
         self.looks: list[int] = []
 
     def followed(self, *, most: int = 500) -> Followed:
-        whole = followed_feed(self.feed, most)
+        whole = followed_feed(self.store, most)
 
         def look(after: int) -> Any:
             self.looks.append(after)
@@ -77,9 +74,9 @@ class Jobs:
         return Followed(look, whole.watch, whole.last, most)
 
     def scan(self, steps: int = 0) -> UUID:
-        job = self.scans.create({}, rig="bench", label=None)
+        job = self.store.create({}, kind=JobKind.SCAN, rig="bench", label=None)
         for step in range(steps):
-            self.scans.progress(job.id, JobProgress("capture", step / 1000, ""))
+            self.store.progress(job.id, JobProgress("capture", step / 1000, ""))
         return job.id
 
     def follow(self, after: int = 0, *, most: int = 500) -> AsyncGenerator[ServerSentEvent]:
@@ -88,7 +85,7 @@ class Jobs:
         return stream
 
     def follow_scan(self, scan: UUID, after: int) -> AsyncIterator[ServerSentEvent]:
-        return stream_of(self.streams, scan, followed_job(self.scans, scan), after)
+        return stream_of(self.streams, scan, followed_job(self.store, scan), after)
 
     async def looked(self, count: int) -> None:
         async with asyncio.timeout(WAIT_S):
@@ -100,7 +97,7 @@ class Jobs:
 def jobs(tmp_path: Path) -> Iterator[Jobs]:
     made = Jobs(tmp_path)
     yield made
-    made.scans.database.close()
+    made.store.database.close()
 
 
 async def some(stream: AsyncIterator[ServerSentEvent], count: int) -> list[dict[str, Any]]:
@@ -119,10 +116,10 @@ async def test_client_ahead_of_its_scan_gets_what_comes_next(jobs: Jobs) -> None
     scan = jobs.scan()
 
     def go_on() -> None:
-        jobs.scans.progress(scan, JobProgress("capture", 0.5, ""))
-        jobs.scans.finish(scan, JobState.SUCCEEDED)
+        jobs.store.progress(scan, JobProgress("capture", 0.5, ""))
+        jobs.store.finish(scan, JobState.SUCCEEDED)
 
-    jobs.scans.act = go_on
+    jobs.store.act = go_on
     assert await rest(jobs.follow_scan(scan, 1000)) == ["2", "3"]
     assert jobs.streams.followed == {}
 
@@ -132,15 +129,15 @@ async def test_client_ahead_of_its_scan_gets_what_comes_next(jobs: Jobs) -> None
 async def test_stream_of_a_deleted_scan_ends(jobs: Jobs, final: bool) -> None:
     scan = jobs.scan()
     woken: list[bool] = []
-    unwatch = jobs.scans.watch(scan, lambda: woken.append(True))
+    unwatch = jobs.store.watch(scan, lambda: woken.append(True))
     stream = jobs.follow_scan(scan, 0)
     assert (await anext(stream)).id == "1"
     if final:
         # The last event wakes the stream, which then finds the scan gone.
-        jobs.scans.act = lambda: jobs.scans.delete(scan)
-        jobs.scans.finish(scan, JobState.SUCCEEDED)
+        jobs.store.act = lambda: jobs.store.delete(scan)
+        jobs.store.finish(scan, JobState.SUCCEEDED)
     else:
-        jobs.scans.delete(scan)
+        jobs.store.delete(scan)
     assert await rest(stream) == []
     unwatch()
     assert woken[0]
@@ -156,9 +153,11 @@ async def test_event_of_any_job_wakes_the_streams_of_all_jobs(jobs: Jobs) -> Non
     assert (first["number"], first["job"]["id"], first["state"]) == (1, str(scan), "queued")
     waiting = asyncio.ensure_future(some(stream, 2))
     await asyncio.sleep(0)
-    pose = await asyncio.to_thread(jobs.poses.create, {"number": 4}, rig="bench", label=None, parent=calibration)
+    pose = await asyncio.to_thread(
+        jobs.store.create, {"number": 4}, kind=JobKind.POSE, rig="bench", label=None, parent=calibration
+    )
     fault = JobFailure("pose-refused", "no board")
-    await asyncio.to_thread(jobs.poses.finish, pose.id, JobState.FAILED, fault=fault)
+    await asyncio.to_thread(jobs.store.finish, pose.id, JobState.FAILED, fault=fault)
     queued, failed = await waiting
     assert (queued["number"], queued["event"], failed["number"]) == (2, "state", 3)
     assert failed["job"] == {
@@ -219,8 +218,8 @@ async def test_end_of_the_service_ends_the_stream_after_the_last_event(jobs: Job
     stream = jobs.follow(1)
     waiting = asyncio.ensure_future(some(stream, 1))
     await jobs.looked(1)
-    await asyncio.to_thread(jobs.scans.finish, scan, JobState.INTERRUPTED)
-    jobs.feed.end()
+    await asyncio.to_thread(jobs.store.finish, scan, JobState.INTERRUPTED)
+    jobs.store.end()
     assert (await waiting)[0]["state"] == "interrupted"
     assert await rest(stream) == []
     assert jobs.streams.followed == {}
@@ -229,13 +228,13 @@ async def test_end_of_the_service_ends_the_stream_after_the_last_event(jobs: Job
 @on_loop
 async def test_events_of_a_deleted_job_are_gone_and_others_go_on(jobs: Jobs) -> None:
     first, second = jobs.scan(steps=2), jobs.scan()
-    jobs.scans.delete(first)
+    jobs.store.delete(first)
 
     stream = jobs.follow()
     assert [each["number"] for each in await some(stream, 1)] == [4]
     waiting = asyncio.ensure_future(some(stream, 1))
     await asyncio.sleep(0)
-    await asyncio.to_thread(jobs.scans.delete, second)
+    await asyncio.to_thread(jobs.store.delete, second)
     await asyncio.to_thread(jobs.scan)
     # A number that was used is never used again.
     assert (await waiting)[0]["number"] == 5

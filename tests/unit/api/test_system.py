@@ -15,10 +15,10 @@ from slrig.api import latency
 from slrig.api.latency import Durations, Latency
 from slrig.devices import AppliedSettings, CameraSettings
 from slrig.jobs.examinations import keep
-from slrig.jobs.worker import Worker
 from slrig.rig.settings import SettingsInUse
 from tests.unit.api.conftest import ServedBench, client_of, ended
 from tests.unit.api.test_access import PATHS, filled
+from tests.unit.jobs.tame_compute import TameCompute
 
 ANSWERS, JOBS, STAGES = (
     "slrig_http_response_start_seconds",
@@ -35,7 +35,7 @@ def test_rig_says_what_it_is_and_how_its_cameras_are_set(client: TestClient, ser
     assert rig["scan_defaults"] == {"line_shift_period_px": 6, "exposure_s": 0.5}
     (camera,) = rig["cameras"]
     assert (camera["size_px"], camera["exposure_s"], camera["gain"], camera["notes"]) == ([64, 48], None, None, [])
-    settings = served.service.runner.queue.rig.settings
+    settings = served.service.manager.rig.settings
     settings[camera["name"]] = SettingsInUse(CameraSettings(0.02), AppliedSettings(0.01, 1.0))
     (camera,) = client.get("/rig").json()["cameras"]
     settings.clear()
@@ -80,8 +80,8 @@ def test_probes_say_what_is_missing(client: TestClient, served: ServedBench, mon
         ("preparing kernels, first time only: 41 of 118", ["reconstruction"]),
         ("the reconstruction cannot be loaded: its process ended", []),
     ):
-        monkeypatch.setattr(Worker, "condition", condition)
-        monkeypatch.setattr(Worker, "loading", bool(pending))
+        monkeypatch.setattr(TameCompute, "condition", condition)
+        monkeypatch.setattr(TameCompute, "loading", bool(pending))
         ready = client.get("/readyz")
         assert (ready.status_code, ready.json()["checks"]["reconstruction"]) == (503, condition)
         assert ready.json()["pending"] == pending

@@ -4,37 +4,36 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
-from unittest.mock import Mock
 from uuid import UUID
 
 import numpy as np
 
-from slrig.bundle import read_calibration
-from slrig.calibrate.calibrating import CalibrationSessions
-from slrig.calibrate.pose_shooting import PoseRequest
-from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState
+from slrig.api.server import KINDS
+from slrig.calibrate.calibrating import Calibrations, PoseRequest
+from slrig.calibrate.pose_judging import Judgement, SessionGuidance
+from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState, Setting
 from slrig.calibrate.solving import CalibrationResult, ReadPose
-from slrig.calibrate.tools import CalibrationTools, Judgement, SessionGuidance, Setting
-from slrig.calibration.accuracy import compare_calibrations
 from slrig.calibration.board import Board, BoardKind, BoardShape, BoardView, PoseObservation, ViewQuality
 from slrig.devices import Rig
 from slrig.errors import PoseRefusedError
-from slrig.jobs.records import JobKind
-from slrig.jobs.rig_jobs import Recorded
-from slrig.jobs.store import JobStore
+from slrig.jobs.manager import JobManager
+from slrig.jobs.resume import resume
 from slrig.model import Calibration, Pinhole, Size, SolveRecord
-from slrig.rig.session import ActiveCalibration
-from slrig.scan.plan import ProgressCallback, ScanPlan
+from slrig.rig.session import ActiveCalibration, RigSession
+from slrig.scan.plan import ProgressCallback
 from tests.samples import put_database
 from tests.unit.scan.bench import Bench, wait_for
-from tests.unit.scan.fakes import WAIT_S, TameBench, TamePositioner
+from tests.unit.scan.fakes import WAIT_S, TamePositioner
+from tests.unit.stand_ins import stand_ins
 
 BOARD = Board(BoardKind.CHESSBOARD, 4, 3, 10.0)
 PNG = b"\x89PNG tame"
 POSITIONS = ("near", "far", "tilted")
+GOOD = {"grade": "good", "summary": "good", "reasons": []}
 
 
 CAMERA, PROJECTOR_SIZE = Size(64, 48), Size(64, 40)
@@ -61,14 +60,13 @@ class TameResult:
 
 
 class TameCalibrating:
-    """What a session works with, as a test says, over the tame devices of a bench.
+    """The mathematics of a session, as a test says.
 
     refusals : of the next poses; unseen : the next pose's frames show no board; read_error, solve_error : raised.
     solving : while it is clear a solve goes on.
     """
 
-    def __init__(self, bench: TameBench) -> None:
-        self.bench = bench
+    def __init__(self) -> None:
         self.refusals: tuple[str, ...] = ()
         self.unseen = False
         self.read_error: Exception | None = None
@@ -76,7 +74,6 @@ class TameCalibrating:
         self.solving = threading.Event()
         self.solving.set()
         self.visited: list[int] = []
-        self.captured: list[tuple[Rig, ScanPlan]] = []
         self.judged: list[list[str]] = []
         self.solved: list[list[str]] = []
         self.earlier: list[Calibration | None] = []
@@ -84,26 +81,24 @@ class TameCalibrating:
         self.tolerance_mm: float | None = None
         self.calibration = tame_calibration()
 
-    def tools(self) -> CalibrationTools:
-        return CalibrationTools(
-            capture=self._capture,
-            read=self._read,
-            judge=self._judge,
-            survey=lambda poses, _: SessionGuidance({"poses": [each.observation.name for each in poses]}, {}),
-            picture=lambda *_: PNG,
-            coverage_picture=lambda _, device, poses, __: f"{device} {len(poses)}".encode(),
-            solve=self._solve,
-            compare=compare_calibrations,
-            parse=read_calibration,
-            report=lambda path, *_: cast("None", path.write_text("<html>report</html>")),
-            summary=lambda _: {"verdict": {"grade": "good", "summary": "good", "reasons": []}},
+    def patched(self) -> AbstractContextManager[None]:
+        """Have the mathematics of calibrations be this within the block."""
+        return stand_ins(
+            {
+                "calibrate.pose_reading.read_pose": self._read,
+                "calibrate.pose_judging.judgement": self._judge,
+                "calibrate.pose_judging.standing": lambda poses, _: SessionGuidance(
+                    {"poses": [each.observation.name for each in poses]}, {}
+                ),
+                "calibrate.pose_judging.write_report": lambda path, *_: path.write_text("<html>report</html>"),
+                "calibrate.pose_judging.summary": lambda _: {
+                    "verdict": {"grade": "good", "summary": "good", "reasons": []}
+                },
+                "calibrate.pose_pictures.pose_png": lambda *_: PNG,
+                "calibrate.pose_pictures.coverage_png": lambda _, device, poses, __: f"{device} {len(poses)}".encode(),
+                "calibrate.solving.solve_poses": self._solve,
+            }
         )
-
-    def _capture(
-        self, rig: Rig, plan: ScanPlan, folder: Path, /, *, progress: ProgressCallback, cancelled: Callable[[], bool]
-    ) -> Recorded:
-        self.captured.append((rig, plan))
-        return self.bench.capture(rig, plan, folder, progress=progress, cancelled=cancelled, frames=Mock())
 
     def _read(self, folder: Path, board: Board, name: str) -> ReadPose:
         assert (folder / "bundle.json").is_file()
@@ -151,22 +146,25 @@ class TameCalibrating:
 
 
 class CalibrationBench(Bench):
-    """A runner over a tame bench, and calibrations over it."""
+    """Calibrations over a tame bench."""
 
     def __init__(self, tmp_path: Path, *, positioner: bool = False) -> None:
         put_database(tmp_path / "data" / "slrig.sqlite")
         super().__init__(tmp_path)
-        self.tame = TameCalibrating(self)
+        self.tame = TameCalibrating()
+        self.patched.enter_context(self.tame.patched())
         self._positioner = positioner
-        self.jobs = JobStore(self.store.database, JobKind.POSE, JobKind.SOLVE)
-        self.calibrations = CalibrationSessions(
-            self.folder, self.runner, self.jobs, rig_name="bench", tools=self.tame.tools()
-        )
+        self.calibrations = Calibrations(self.manager)
 
-    def restarted(self) -> CalibrationSessions:
-        """The calibrations as the next start of the service has them."""
-        again = CalibrationSessions(self.folder, self.runner, self.jobs, rig_name="bench", tools=self.tame.tools())
-        again.take_up()
+    def restarted(self, *, start: bool = False) -> Calibrations:
+        """The calibrations as the next start of the service has them. start : jobs go on."""
+        manager = JobManager(self.store, self.folder, RigSession("bench", self.open_rig), self.worker, *KINDS)
+        self.patched.callback(manager.close)
+        again = Calibrations(manager)
+        again.settle()
+        resume(manager)
+        if start:
+            manager.start()
         return again
 
     def open_rig(self) -> Rig:
@@ -181,7 +179,7 @@ class CalibrationBench(Bench):
     def until_session(self, session_id: UUID, done: Callable[[SessionRecord], bool]) -> SessionRecord:
         """The session once `done` says so."""
         register = self.calibrations.register
-        wait_for(register.jobs, session_id, lambda: done(register.get(session_id)))
+        wait_for(self.store, session_id, lambda: done(register.get(session_id)))
         return register.get(session_id)
 
     def record(self, session_id: UUID) -> SessionRecord:
@@ -191,7 +189,7 @@ class CalibrationBench(Bench):
     @property
     def in_use(self) -> ActiveCalibration:
         """The calibration that scans are made with."""
-        active = self.runner.status().active
+        active = self.manager.status().active
         assert active is not None
         return active
 
@@ -201,20 +199,20 @@ class CalibrationBench(Bench):
 
     def shot(self, session_id: UUID, request: PoseRequest = PoseRequest()) -> PoseRecord:  # noqa: B008 - frozen
         """A pose that has its answer."""
-        pose = self.calibrations.poses.shoot(session_id, request, wait=True)
+        pose = self.calibrations.shoot(session_id, request, wait=True)
         return self.until_pose(session_id, pose.number)
 
     def held_pose(self, session_id: UUID) -> PoseRecord:
         """A pose that is being shot until `gate` is set."""
         self.began.clear()
         self.gate.clear()
-        pose = self.calibrations.poses.shoot(session_id, PoseRequest(), wait=False)
+        pose = self.calibrations.shoot(session_id, PoseRequest(), wait=False)
         assert self.began.wait(WAIT_S)
         return pose
 
     def solve(self, session_id: UUID, state: SessionState = SessionState.SOLVED) -> SessionRecord:
         """Solve a session, which ends in this state."""
-        self.calibrations.solves.solve(session_id)
+        self.calibrations.solve(session_id)
         record = self.until_session(session_id, lambda found: found.state is not SessionState.SOLVING)
         assert record.state is state, record.fault
         return record
@@ -228,9 +226,5 @@ class CalibrationBench(Bench):
         return session_id
 
     def close(self) -> None:
-        self.gate.set()
         self.tame.solving.set()
-        self.runner.close()
-        self.calibrations.close()
-        self.store.database.close()
-        self.folder.release()
+        super().close()

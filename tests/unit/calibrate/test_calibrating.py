@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from uuid import UUID, uuid4
@@ -14,10 +15,11 @@ import pytest
 from structlog.testing import capture_logs
 
 from slrig.bundle.calibration import read_calibration, write_calibration
-from slrig.calibrate.pose_shooting import PoseRequest
-from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState, with_jobs
+from slrig.calibrate.calibrating import PoseRequest
+from slrig.calibrate.jobs import PoseJob
+from slrig.calibrate.records import SessionRecord, SessionState, with_jobs
 from slrig.calibrate.retention import Retention, named_by_scans
-from slrig.calibrate.store import CalibrationStore
+from slrig.calibrate.store import CalibrationStore, session_readings
 from slrig.errors import (
     ArtefactNotReadyError,
     CalibrationError,
@@ -28,9 +30,8 @@ from slrig.errors import (
     StorageError,
     UnsupportedByDeviceError,
 )
-from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState
+from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, read_record, write_record
 from slrig.model import Size
-from slrig.scan.sweep import sweep
 from tests.unit.calibrate.calibration_bench import PNG, CalibrationBench, tame_calibration
 from tests.unit.scan.fakes import WAIT_S
 
@@ -38,7 +39,7 @@ from tests.unit.scan.fakes import WAIT_S
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[CalibrationBench]:
     bench = CalibrationBench(tmp_path)
-    bench.runner.start()
+    bench.manager.start()
     yield bench
     bench.close()
 
@@ -47,7 +48,7 @@ def bench(tmp_path: Path) -> Iterator[CalibrationBench]:
 def moved(tmp_path: Path) -> Iterator[CalibrationBench]:
     """A bench with a positioner, open."""
     bench = CalibrationBench(tmp_path, positioner=True)
-    bench.runner.start()
+    bench.manager.start()
     bench.until(bench.scan().id)
     yield bench
     bench.close()
@@ -64,7 +65,9 @@ def test_session_walks_from_poses_to_the_calibration_in_use(bench: CalibrationBe
     assert record.next_move == {"words": "tilt it", "enough": False}
     assert (dict(record.cameras), record.projector) == ({"cam0": Size(64, 48)}, Size(64, 40))
     place = bench.calibrations.store.pose(session_id, 1)
-    assert {path.name for path in place.iterdir()} == {"bundle", "answer.json", "picture-cam0.png", "reading.npz"}
+    assert {path.name for path in place.iterdir()} == {
+        "bundle", "answer.json", "picture-cam0.png", "reading.npz", "record.json",
+    }  # fmt: skip
     assert (place / "picture-cam0.png").read_bytes() == PNG
 
     assert bench.solve(session_id).solve == 1
@@ -75,17 +78,17 @@ def test_session_walks_from_poses_to_the_calibration_in_use(bench: CalibrationBe
     assert solved.id == str(session_id)
     assert bench.calibrations.file(session_id, "report.html").read_text() == "<html>report</html>"
 
-    assert bench.runner.status().active is None
+    assert bench.manager.status().active is None
     bench.calibrations.activate(session_id)
     assert bench.in_use.name == str(session_id)
     assert bench.calibrations.active == session_id
     assert list(bench.folder.incoming.iterdir()) == []
     assert bench.opened[0][1].dark
 
-    events = bench.jobs.events_of(session_id, after=0)
+    events = bench.store.events_of(session_id, after=0)
     numbers = [event.number for event in events]
     assert numbers == sorted(set(numbers))
-    assert numbers[-1] == bench.jobs.last_event_of(session_id)
+    assert numbers[-1] == bench.store.last_event_of(session_id)
     of_each = ["queued", "capturing", "computing", "succeeded"]
     of_all = [*of_each, *of_each, "queued", "computing", "succeeded"]
     assert [event.data["state"] for event in events if event.kind == "state"] == of_all
@@ -112,7 +115,7 @@ def test_the_progress_of_a_session_is_that_of_its_job_under_way() -> None:
 def test_pose_is_shot_along_both_axes_and_knows_no_earlier_calibration(bench: CalibrationBench) -> None:
     bench.calibrations.activate(bench.solved())
     bench.shot(bench.session(), PoseRequest(exposure_s=0.02))
-    rig, plan = bench.tame.captured[-1]
+    rig, plan, _ = bench.captured[-1]
     assert plan.patterns.rows
     assert plan.patterns.line_shift
     assert plan.exposure_s == 0.02
@@ -165,17 +168,17 @@ def test_dropped_pose_is_in_no_solve_and_its_number_is_not_given_again(bench: Ca
     session_id = bench.session()
     bench.shot(session_id)
     bench.shot(session_id)
-    bench.calibrations.poses.drop(session_id, 1)
+    bench.calibrations.drop(session_id, 1)
     record = bench.record(session_id)
     assert [pose.number for pose in record.poses] == [2]
     assert record.coverage == {"poses": ["pose 2"]}
     assert not bench.calibrations.store.pose(session_id, 1).exists()
     with pytest.raises(CalibrationNotFoundError, match="its poses: 2"):
-        bench.calibrations.poses.drop(session_id, 1)
+        bench.calibrations.drop(session_id, 1)
     assert bench.shot(session_id).number == 3
     held = bench.held_pose(session_id)
     with pytest.raises(CalibrationStateError, match="Pose 4 is capturing"):
-        bench.calibrations.poses.drop(session_id, held.number)
+        bench.calibrations.drop(session_id, held.number)
 
 
 def test_positioner_takes_a_pose_or_all_in_turn(moved: CalibrationBench) -> None:
@@ -183,30 +186,30 @@ def test_positioner_takes_a_pose_or_all_in_turn(moved: CalibrationBench) -> None
     pose = moved.shot(session_id, PoseRequest(position="far"))
     assert (pose.position, pose.position_name) == (1, "far")
     assert moved.tame.visited == [1]
-    moved.calibrations.poses.script(session_id, (), PoseRequest(), wait=False)
+    moved.calibrations.script(session_id, (), PoseRequest(), wait=False)
     record = moved.until_session(session_id, lambda found: len(found.accepted) == 4)
     assert moved.tame.visited == [1, 0, 1, 2]
     assert record.script == ()
-    moved.calibrations.poses.script(session_id, ("tilted", 0), PoseRequest(exposure_s=0.02), wait=False)
+    moved.calibrations.script(session_id, ("tilted", 0), PoseRequest(exposure_s=0.02), wait=False)
     moved.until_session(session_id, lambda found: len(found.accepted) == 6)
     assert moved.tame.visited[4:] == [2, 0]
-    assert [plan.exposure_s for _, plan in moved.tame.captured] == [None] * 4 + [0.02] * 2
+    assert [plan.exposure_s for _, plan, _ in moved.captured[1:]] == [None] * 4 + [0.02] * 2
     with pytest.raises(UnsupportedByDeviceError, match="found 7, this rig has 0 to 2: near, far, tilted"):
-        moved.calibrations.poses.shoot(session_id, PoseRequest(position=7), wait=False)
+        moved.calibrations.shoot(session_id, PoseRequest(position=7), wait=False)
 
 
 def test_failed_or_cancelled_pose_ends_its_script(moved: CalibrationBench) -> None:
     session_id = moved.session()
     moved.began.clear()
     moved.gate.clear()
-    first = moved.calibrations.poses.script(session_id, (), PoseRequest(), wait=False)
+    first = moved.calibrations.script(session_id, (), PoseRequest(), wait=False)
     assert moved.began.wait(WAIT_S)
     assert moved.record(session_id).script == (1, 2)
-    moved.calibrations.poses.cancel(session_id, first.number)
+    moved.calibrations.cancel(session_id, first.number)
     assert moved.until_pose(session_id, first.number).state is JobState.CANCELLED
     moved.gate.set()
     moved.error = DeviceGoneError("Camera 'cam0' was unplugged.")
-    second = moved.calibrations.poses.script(session_id, (), PoseRequest(), wait=True)
+    second = moved.calibrations.script(session_id, (), PoseRequest(), wait=True)
     assert moved.until_pose(session_id, second.number).state is JobState.FAILED
     record = moved.record(session_id)
     assert (record.script, record.latest_pose, moved.tame.visited) == ((), 2, [0, 0])
@@ -214,7 +217,7 @@ def test_failed_or_cancelled_pose_ends_its_script(moved: CalibrationBench) -> No
 
 def test_rig_without_a_positioner_says_so(bench: CalibrationBench) -> None:
     bench.until(bench.scan().id)
-    poses = bench.calibrations.poses
+    poses = bench.calibrations
     with pytest.raises(UnsupportedByDeviceError, match="no positioner"):
         poses.shoot(bench.session(), PoseRequest(position=0), wait=False)
     with pytest.raises(UnsupportedByDeviceError, match="no positioner"):
@@ -224,18 +227,18 @@ def test_rig_without_a_positioner_says_so(bench: CalibrationBench) -> None:
 def test_solve_is_refused_until_it_makes_sense(bench: CalibrationBench) -> None:
     session_id = bench.session()
     with pytest.raises(SolveRefusedError, match="no accepted pose"):
-        bench.calibrations.solves.solve(session_id)
+        bench.calibrations.solve(session_id)
     bench.held_pose(session_id)
     with pytest.raises(CalibrationStateError, match="pose 1 is still under way"):
-        bench.calibrations.solves.solve(session_id)
+        bench.calibrations.solve(session_id)
     bench.gate.set()
     bench.until_pose(session_id, 1)
     bench.tame.solving.clear()
-    bench.calibrations.solves.solve(session_id)
+    bench.calibrations.solve(session_id)
     with pytest.raises(CalibrationStateError, match="is being solved already"):
-        bench.calibrations.solves.solve(session_id)
+        bench.calibrations.solve(session_id)
     with pytest.raises(CalibrationStateError, match="is being solved"):
-        bench.calibrations.poses.shoot(session_id, PoseRequest(), wait=False)
+        bench.calibrations.shoot(session_id, PoseRequest(), wait=False)
     with pytest.raises(CalibrationStateError, match="under way"):
         bench.calibrations.delete(session_id)
     bench.tame.solving.set()
@@ -278,7 +281,7 @@ def test_calibration_in_use_is_not_deleted_and_can_be_let_go(bench: CalibrationB
     with pytest.raises(CalibrationStateError, match=r"is in use.*deactivate"):
         bench.calibrations.delete(session_id)
     bench.calibrations.deactivate(session_id)
-    assert bench.runner.status().active is None
+    assert bench.manager.status().active is None
     with pytest.raises(CalibrationStateError, match="not in use"):
         bench.calibrations.deactivate(session_id)
     bench.calibrations.delete(session_id)
@@ -315,7 +318,7 @@ def test_exported_calibration_comes_in_again(bench: CalibrationBench, name: str)
     assert again.solved is not None
     assert again.solved.expected_error_mm == 0.02
     with pytest.raises(CalibrationStateError, match="was imported and has no board"):
-        bench.calibrations.poses.shoot(record.id, PoseRequest(), wait=False)
+        bench.calibrations.shoot(record.id, PoseRequest(), wait=False)
     with pytest.raises(ArtefactNotReadyError, match="was imported"):
         bench.calibrations.file(record.id, "report.html")
     bench.calibrations.activate(record.id)
@@ -329,11 +332,10 @@ def test_restart_keeps_the_active_one_and_marks_what_was_cut_off(bench: Calibrat
     solving = bench.session()
     bench.shot(solving)
     bench.tame.solving.clear()
-    bench.calibrations.solves.solve(solving)
+    bench.calibrations.solve(solving)
     staged = bench.folder.staging(bench.held_pose(session_id).id)
     assert staged.is_dir()
     # What a power cut leaves, seen by the next start.
-    sweep(bench.store, bench.folder)
     again = bench.restarted()
     assert not staged.exists()
     assert again.active == active
@@ -342,37 +344,32 @@ def test_restart_keeps_the_active_one_and_marks_what_was_cut_off(bench: Calibrat
     fault = record.poses[1].fault
     assert fault is not None
     assert (fault.code, "Start it again" in fault.message) == ("scan-interrupted", True)
-    # A solve may end yet; the next start tells of one that did not.
-    assert again.register.get(solving).state is SessionState.FAILED
+    # What is read lies on the disk: the solve is done once more.
+    assert again.register.get(solving).state is SessionState.SOLVING
     assert [each.id for each in again.latest()] == [solving, session_id, active]
-    assert [each.observation.name for each in again.store.readings(record)] == ["pose 1"]
+    assert [each.observation.name for each in session_readings(again.store.folder(record.id))] == ["pose 1"]
 
 
 def test_pose_that_waited_is_shot_after_a_restart_and_one_with_its_frames_is_read(bench: CalibrationBench) -> None:
     session_id = bench.session()
     bench.shot(session_id)
-    waiting, whole, answered = (
-        bench.jobs.create(
-            PoseRecord(number, uuid4(), JobState.QUEUED, datetime.now(UTC)).plan,
-            rig="bench", label=None, kind=JobKind.POSE, parent=session_id,
-        )
-        for number in (2, 3, 4)
-    )  # fmt: skip
-    bench.jobs.advance(whole.id, JobState.COMPUTING)
+    waiting, whole, answered = (bench.manager.record(PoseJob(session_id, number))[0] for number in (2, 3, 4))
+    bench.store.advance(whole.id, JobState.COMPUTING)
     bundle = bench.folder.stage(whole.id) / "bundle"
-    bundle.mkdir()
-    (bundle / "bundle.json").write_text("{}")
+    shutil.copytree(bench.calibrations.store.pose(session_id, 1) / "bundle", bundle)
     # It was ended between its answer and its place.
     (bench.folder.staging(whole.id) / "answer.json").write_text("{}")
-    bench.jobs.advance(answered.id, JobState.COMPUTING)
+    bench.store.advance(answered.id, JobState.COMPUTING)
     place = bench.calibrations.store.pose(session_id, 4)
     shutil.copytree(bench.calibrations.store.pose(session_id, 1), place)
-    sweep(bench.store, bench.folder)
-    bench.calibrations = bench.restarted()
+    first = read_record(place)
+    assert first is not None
+    write_record(place, replace(first, id=answered.id, plan=answered.plan))
+    bench.calibrations = bench.restarted(start=True)
     record = bench.until_session(session_id, lambda found: not found.under_way)
     assert [pose.state for pose in record.poses] == [JobState.SUCCEEDED] * 4
-    assert len(bench.tame.captured) == 2
-    assert bench.jobs.attempts(waiting.id) == 1
+    assert len(bench.captured) == 2
+    assert bench.store.attempts(waiting.id) == 1
 
 
 def test_poses_outlive_their_records_and_records_do_not_outlive_their_files(bench: CalibrationBench) -> None:
@@ -381,7 +378,7 @@ def test_poses_outlive_their_records_and_records_do_not_outlive_their_files(benc
     bench.tame.refusals = ("hold it still.",)
     bench.shot(session_id)
     before = bench.record(session_id)
-    bench.jobs.delete_of(session_id)
+    bench.store.delete_of(session_id)
     again = bench.restarted().register.get(session_id)
     told = [(pose.number, pose.state, pose.answer, pose.fault) for pose in again.poses]
     assert told == [(pose.number, pose.state, pose.answer, pose.fault) for pose in before.poses]

@@ -18,9 +18,9 @@ from slrig.bundle.calibration import require_two_rays
 from slrig.calibrate.charts import error_slices
 from slrig.calibrate.figures import baselines, device_figures, pose_figures
 from slrig.calibrate.pose_judging import judgement, summary
+from slrig.calibrate.records import Setting
 from slrig.calibrate.report import report_html
 from slrig.calibrate.solving import CalibrationResult, ReadPose, solve_poses
-from slrig.calibrate.tools import Setting
 from slrig.calibration.accuracy import compare_calibrations
 from slrig.calibration.board import BoardShape, ViewQuality
 from slrig.calibration.health.verification import verify_by_board

@@ -250,12 +250,12 @@ class Rig:
         self.database = Database(folder / f"{name}.sqlite")
         self.copies = Copies(self.database)
         outbox = Outbox(self.database, copies=self.copies if copied else None)
-        self.jobs = JobStore(self.database, JobKind.SCAN, outbox=outbox)
+        self.jobs = JobStore(self.database, outbox=outbox)
         self.copier = Copier(catalogue, self.copies, lambda: self.standing, clock=lambda: self.now_s)
         self.standing = {key: value for key, value in row(name).items() if key != "uncopied"}
 
     def end_job(self, label: str, *, deleted: bool = False) -> None:
-        job = self.jobs.create({}, rig=self.name, label=label)
+        job = self.jobs.create({}, kind=JobKind.SCAN, rig=self.name, label=label)
         self.jobs.finish(job.id, JobState.SUCCEEDED, summary={"mesh": {"points": 3, "figures": {"triangles": 1}}})
         if deleted:
             self.jobs.delete(job.id)

@@ -10,20 +10,21 @@ from typing import Any
 from uuid import UUID, uuid4
 
 from slrig.bundle.options import AxisSource
-from slrig.combine.desk import ModelDesk
+from slrig.combine.job import TURNTABLE, Models
 from slrig.combine.offered import MEDIA_TYPES, REPORT
 from slrig.combine.plan import StartingPoses
 from slrig.combine.turntable import TurntableStore
 from slrig.errors import ScanCancelledError
 from slrig.jobs.data_folder import DataFolder
-from slrig.jobs.records import JobKind, JobRecord, utc_now
+from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, utc_now
+from slrig.jobs.resume import resume
 from slrig.jobs.store import JobStore
 from slrig.model import MeasuredAxis, TurntablePlane
 from slrig.scan.plan import ProgressCallback, ScanPlan
 from slrig.scan.records import plan_json
-from slrig.scan.sweep import sweep
 from tests.samples import put_database
 from tests.unit.scan.bench import Bench, wait_for
+from tests.unit.stand_ins import stand_ins
 
 
 def kept_scan(store: JobStore, folder: DataFolder, *, angle_deg: float | None = None, mesh: bytes = b"ply") -> UUID:
@@ -33,9 +34,13 @@ def kept_scan(store: JobStore, folder: DataFolder, *, angle_deg: float | None = 
     (folder.scan(scan_id) / "mesh.ply").write_bytes(mesh)
     turntable = {} if angle_deg is None else {"turntable": {"angle_deg": angle_deg, "turned_by": "table"}}
     (folder.scan(scan_id) / "report.json").write_text(json.dumps({"format": "slrig-report", **turntable}))
-    store.restore(
-        scan_id, plan_json(ScanPlan()), {}, rig="bench", label=None, created_at=utc_now(), started_at=utc_now()
-    )
+    now = utc_now()
+    nothing = JobProgress("", 0.0, "")
+    record = JobRecord(
+        0, scan_id, JobKind.SCAN, JobState.SUCCEEDED, None, "bench", plan_json(ScanPlan()), now, now, now, nothing,
+        None, {},
+    )  # fmt: skip
+    store.restore(record)
     store.pin(scan_id, pinned=False)
     return scan_id
 
@@ -102,37 +107,37 @@ def model_files(
 
 
 class ModelBench(Bench):
-    """A desk for models and a runner of scans. start : begin at once; else what is taken up waits for that."""
+    """Models over a tame bench. start : begin at once; else what is on record waits for that."""
 
     def __init__(self, root: Path, *, keep: int = 100, start: bool = True, axis: MeasuredAxis | None = None) -> None:
         put_database(root / "data" / "slrig.sqlite")
         super().__init__(root)
         self.tame = TameCombining()
-        self.models = JobStore(self.store.database, JobKind.MODEL)
-        sweep(self.store, self.folder)
-        self.turntable = TurntableStore(root / "turntable")
+        self.patched.enter_context(stand_ins({"combine.combining.combine_into": self.tame}))
+        self.turntable = TurntableStore(self.folder.root / TURNTABLE)
         if axis is not None:
             self.turntable.put_axis(axis, source=AxisSource.BOARD, of="a board")
-        self.desk = ModelDesk(
-            self.folder,
-            self.runner.queue,
-            self.models,
-            scans=self.store,
-            combine=self.tame,
-            turntable=self.turntable,
-            keep=keep,
-        )
-        self.runner.spare_what_is_used(self.desk.unused)
+        self.models = Models(self.manager, turntable=self.turntable, keep=keep)
         if start:
-            self.desk.take_up()
-            self.runner.start()
+            self.start()
+
+    def start(self) -> None:
+        """Go on with what is on record."""
+        resume(self.manager)
+        self.models.remove_old()
+        self.manager.start()
+
+    def delete_scan(self, scan_id: UUID) -> None:
+        """As the service does."""
+        with self.models.unused(scan_id):
+            self.manager.delete(scan_id)
 
     def kept_scans(self, *angles_deg: float | None) -> tuple[UUID, ...]:
         return tuple(kept_scan(self.store, self.folder, angle_deg=angle) for angle in angles_deg)
 
     def over(self, model_id: UUID) -> JobRecord:
         """The model once it is in a final state."""
-        return until(self.models, model_id, lambda model: model.state.final)
+        return until(self.store, model_id, lambda model: model.state.final)
 
     def close(self) -> None:
         self.tame.gate.set()

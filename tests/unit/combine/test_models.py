@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -40,11 +39,11 @@ from slrig.errors import (
     ViewsFailedError,
 )
 from slrig.failure import interruption_error, job_failure
-from slrig.jobs.job import Holder, Job
-from slrig.jobs.records import JobProgress, JobRecord, JobState, utc_now
-from slrig.jobs.rig_jobs import Recorded
+from slrig.jobs.job import Recording
+from slrig.jobs.records import RECORD, JobKind, JobProgress, JobRecord, JobState, utc_now, write_record
+from slrig.jobs.resume import resume
 from slrig.model import MeasuredAxis, PlaneKind, TurntablePlane
-from slrig.rig.session import RigSession
+from slrig.scan.job import series
 from slrig.scan.plan import ScanPlan
 from slrig.scan.records import plan_from_json as scan_plan_from_json
 from slrig.scan.records import plan_json as scan_plan_json
@@ -66,7 +65,7 @@ def bench(tmp_path: Path) -> Iterator[ModelBench]:
 
 def test_a_model_is_made_of_scans_on_a_stage_and_lies_in_its_place(bench: ModelBench) -> None:
     scans = bench.kept_scans(0.0, 40.0, 80.0)
-    made = bench.desk.combine(ModelPlan(scans, TurntablePoses(AXIS), voxel_mm=0.4), label="cup")
+    made = bench.models.combine(ModelPlan(scans, TurntablePoses(AXIS), voxel_mm=0.4), label="cup")
     done = bench.over(made.id)
     assert (done.state, done.label, done.rig) == (JobState.SUCCEEDED, "cup", "bench")
     # What it is made with is on record, whatever becomes of reports and turntable.
@@ -76,12 +75,12 @@ def test_a_model_is_made_of_scans_on_a_stage_and_lies_in_its_place(bench: ModelB
     assert list(meshes) == [str(scan) for scan in scans]
     assert [mesh.read_bytes() for mesh in meshes.values()] == [b"ply"] * 3
     assert (poses, start_error_mm, voxel_mm) == (used.poses, 3.0, 0.4)
-    assert {file.name for file in bench.desk.store.place(made.id).iterdir()} == set(MEDIA_TYPES)
+    assert {file.name for file in bench.models.place(made.id).iterdir()} == {*MEDIA_TYPES, RECORD}
     assert done.summary == {
         "views": 3, "pairs": 2, "free": 0, "pose_sigma_mm": 0.004, "vertices": 9, "triangles": 12, "voxel_mm": 0.5,
         "sigma_mm": 0.01,
     }  # fmt: skip
-    told = [event.data for event in bench.models.events(made.id, after=0)]
+    told = [event.data for event in bench.store.events(made.id, after=0)]
     assert [each["state"] for each in told if "time" in each] == ["queued", "computing", "succeeded"]
     assert "registering" in [each.get("stage") for each in told]
     assert list(bench.folder.incoming.iterdir()) == []
@@ -92,7 +91,7 @@ def test_the_axis_is_the_stages_own_unless_it_is_said(tmp_path: Path) -> None:
     scans = bench.kept_scans(None, None)
     for axis, expected in ((None, StatedAxis((1.0, 2.0, 3.0), (0.0, 0.0, 1.0))), (AXIS, AXIS)):
         plan = ModelPlan(scans, TurntablePoses(axis, (10.0, 55.0)))
-        assert bench.desk.settled(plan).poses == TurntablePoses(expected, (10.0, 55.0), of_turntable=axis is None)
+        assert bench.models.settled(plan).poses == TurntablePoses(expected, (10.0, 55.0), of_turntable=axis is None)
     bench.close()
 
 
@@ -106,12 +105,12 @@ def test_views_are_cut_by_the_stages_planes_and_the_axis_found_is_noted(tmp_path
     }  # fmt: skip
     for cut in (True, False):
         scans = bench.kept_scans(0.0, 40.0)
-        made = bench.over(bench.desk.combine(ModelPlan(scans, TurntablePoses(), cut=cut)).id)
+        made = bench.over(bench.models.combine(ModelPlan(scans, TurntablePoses(), cut=cut)).id)
         assert [each.kind for each in bench.tame.planes] == [PlaneKind.PLATE] * cut
         assert bench.turntable.record().history[-1].of == str(made.id)
     # The same scans once more add nothing, nor does an axis that a person has stated.
     for known, poses in ((scans, TurntablePoses()), (bench.kept_scans(0.0, 40.0), TurntablePoses(AXIS))):
-        bench.over(bench.desk.combine(ModelPlan(known, poses)).id)
+        bench.over(bench.models.combine(ModelPlan(known, poses)).id)
         assert bench.turntable.record().history[-1].of == str(made.id)
     axis = bench.turntable.axis()
     assert axis is not None
@@ -121,7 +120,7 @@ def test_views_are_cut_by_the_stages_planes_and_the_axis_found_is_noted(tmp_path
 
 def test_what_cannot_be_made_is_refused_before_it_is_on_record(bench: ModelBench) -> None:
     first, second = bench.kept_scans(0.0, None)
-    failed = bench.store.create(scan_plan_json(ScanPlan()), rig="bench", label=None).id
+    failed = bench.store.create(scan_plan_json(ScanPlan()), kind=JobKind.SCAN, rig="bench", label=None).id
     bench.store.finish(failed, JobState.FAILED, fault=job_failure(StorageError("full")))
     both = (first, second)
     refused: list[tuple[Callable[[], ModelPlan], type[SlrigError], str]] = [
@@ -138,32 +137,32 @@ def test_what_cannot_be_made_is_refused_before_it_is_on_record(bench: ModelBench
     ]
     for plan, error, words in refused:
         with pytest.raises(error, match=words):
-            bench.desk.combine(plan())
+            bench.models.combine(plan())
     bench.free_bytes = 8
     with pytest.raises(StorageError, match="are free"):
-        bench.desk.combine(ModelPlan(both, GivenPoses((STILL, STILL))))
+        bench.models.combine(ModelPlan(both, GivenPoses((STILL, STILL))))
     bench.free_bytes = 10**9
     (bench.folder.scan(second) / "mesh.ply").unlink()
     with pytest.raises(StorageError, match=f"Leave scan {second} out"):
-        bench.desk.combine(ModelPlan(both, GivenPoses((STILL, STILL))))
-    assert bench.models.states() == {}
+        bench.models.combine(ModelPlan(both, GivenPoses((STILL, STILL))))
+    assert bench.store.states(JobKind.MODEL) == {}
 
 
 def test_scans_that_a_model_needs_stay_until_it_is_over(bench: ModelBench) -> None:
     scans = bench.kept_scans(0.0, 40.0)
-    retention = ScanRetention(bench.store, bench.folder, ScanLimits(count=1), bench.runner.delete)
+    retention = ScanRetention(bench.store, bench.folder, ScanLimits(count=1), bench.delete_scan)
     bench.tame.gate.clear()
     plan = ModelPlan(scans, TurntablePoses(AXIS))
-    models = [bench.desk.combine(plan) for _ in range(2)]
+    models = [bench.models.combine(plan) for _ in range(2)]
     with pytest.raises(QueueFullError, match="2 models are made"):
-        bench.desk.combine(plan)
+        bench.models.combine(plan)
     with pytest.raises(ScanStateError, match=f"needed by model {models[0].id}"):
-        bench.runner.delete(scans[0])
+        bench.delete_scan(scans[0])
     with pytest.raises(ScanStateError, match="Cancel it first"):
-        bench.desk.delete(models[0].id)
+        bench.manager.delete(models[0].id)
     assert retention.apply() == []
     for model in models:
-        bench.desk.cancel(model.id)
+        bench.manager.cancel(model.id)
         assert bench.over(model.id).state is JobState.CANCELLED
     assert retention.apply() == [scans[0]]
     assert list(bench.folder.incoming.iterdir()) == []
@@ -172,11 +171,11 @@ def test_scans_that_a_model_needs_stay_until_it_is_over(bench: ModelBench) -> No
 def test_the_newest_models_are_kept(tmp_path: Path) -> None:
     bench = ModelBench(tmp_path, keep=2)
     plan = ModelPlan(bench.kept_scans(0.0, 40.0), TurntablePoses(AXIS))
-    made = [bench.over(bench.desk.combine(plan).id).id for _ in range(4)]
+    made = [bench.over(bench.models.combine(plan).id).id for _ in range(4)]
     # The one that is asked for makes room when it is over.
-    assert sorted(bench.models.states()) == sorted(made[1:])
-    bench.desk.delete(made[2])
-    kept = {each.name for each in bench.desk.store.place(made[0]).parent.iterdir()}
+    assert sorted(bench.store.states(JobKind.MODEL)) == sorted(made[1:])
+    bench.manager.delete(made[2])
+    kept = {each.name for each in bench.models.place(made[0]).parent.iterdir()}
     assert kept == {str(made[1]), str(made[3])}
     bench.close()
 
@@ -185,14 +184,16 @@ def cut_off(bench: ModelBench, *, attempts: int, files: bool = False) -> UUID:
     """A model that was being made for the so-manieth time when the service was killed."""
     scans = bench.kept_scans(0.0, 40.0)
     plan = ModelPlan(scans, TurntablePoses(AXIS, (0.0, 40.0)))
-    model_id = bench.models.create(plan_json(plan), rig="bench", label=None).id
+    model_id = bench.store.create(plan_json(plan), kind=JobKind.MODEL, rig="bench", label=None).id
     for _ in range(attempts):
-        bench.models.advance(model_id, JobState.COMPUTING)
+        bench.store.advance(model_id, JobState.COMPUTING)
     staged = bench.folder.stage(model_id)
     (staged / MODEL).write_bytes(b"half")
     if files:
-        model_files(bench.desk.store.stage(model_id), [str(scan) for scan in scans])
-        bench.desk.store.commit(model_id)
+        (staged / MODEL).unlink()
+        model_files(staged, [str(scan) for scan in scans])
+        write_record(staged, replace(bench.store.get(model_id), state=JobState.SUCCEEDED, summary={"views": 2}))
+        bench.folder.put(model_id, bench.models.place(model_id))
     return model_id
 
 
@@ -202,10 +203,10 @@ def test_what_was_cut_off_is_made_once_more_and_no_file_is_lost(tmp_path: Path) 
     placed = cut_off(killed, attempts=1, files=True)
     gone, deleted = (cut_off(killed, attempts=1, files=True) for _ in range(2))
     for model_id in (gone, deleted):
-        killed.models.finish(model_id, JobState.SUCCEEDED)
-    (killed.desk.store.place(gone) / MODEL).unlink()
-    killed.desk.store.withdraw(deleted)
-    (killed.desk.store.place(gone).parent / "stranger").mkdir()
+        killed.store.finish(model_id, JobState.SUCCEEDED)
+    (killed.models.place(gone) / MODEL).unlink()
+    killed.folder.withdraw(killed.models.place(deleted), deleted)
+    (killed.models.place(gone).parent / "stranger").mkdir()
     killed.close()
     bench = ModelBench(tmp_path)
     assert bench.over(queued).state is bench.over(once).state is JobState.SUCCEEDED
@@ -219,11 +220,11 @@ def test_what_was_cut_off_is_made_once_more_and_no_file_is_lost(tmp_path: Path) 
     assert lost.state is JobState.FAILED
     assert lost.fault is not None
     assert f"{MODEL} of this model is gone" in lost.fault.message
-    assert deleted not in bench.models.states()
-    assert {each.name for each in bench.desk.store.place(gone).parent.iterdir()} == {
+    assert deleted not in bench.store.states(JobKind.MODEL)
+    assert {each.name for each in bench.models.place(gone).parent.iterdir()} == {
         str(each) for each in (queued, once, placed, gone)
     }
-    assert [each.name for each in bench.folder.orphans.iterdir()] == ["model-stranger"]
+    assert [each.name for each in bench.folder.orphans.iterdir()] == ["models-stranger"]
     assert list(bench.folder.incoming.iterdir()) == []
     bench.close()
 
@@ -250,22 +251,19 @@ class ShootingBench(ModelBench):
         self.shot: list[float | None] = []
         self.faults: dict[float, list[Exception]] = {}
         super().__init__(root, start=False, **options)
-        self.shooting = ViewShooting(self.desk, self.runner, self.store)
-        self.store.after_end = self.shooting.view_ended
+        self.shooting = ViewShooting(self.models, self.manager)
         if start:
-            known = threading.Event()
-            self.runner.queue.add([_look(known)])
-            # As a service does it.
-            self.runner.take_up([scan.id for scan in self.store.unfinished()])
-            self.desk.take_up()
+            # As a service does it, but for the rig, whose turntable is known at once.
+            self.manager.rig.open()
+            resume(self.manager)
+            self.store.after_end = self.shooting.view_ended
             self.shooting.take_up()
-            self.runner.start()
-            assert known.wait(WAIT_S)
+            self.manager.start()
 
     def open_rig(self) -> Rig:
         return replace(super().open_rig(), positioner=self.table)
 
-    def capture(self, rig: Rig, plan: ScanPlan, folder: Path, /, **how: Any) -> Recorded:
+    def capture(self, rig: Rig, plan: ScanPlan, folder: Path, /, **how: Any) -> Recording:
         self.shot.append(plan.turn_deg)
         if faults := self.faults.get(plan.turn_deg or 0.0):
             raise faults.pop(0)
@@ -273,21 +271,12 @@ class ShootingBench(ModelBench):
 
     def views(self, model_id: UUID) -> list[tuple[float | None, JobState]]:
         """Angle and state of each scan of a model, from the first to the last."""
-        scans = self.store.of(model_id).get(model_id, [])
+        scans = self.store.of(model_id)
         return [(scan_plan_from_json(scan.plan).turn_deg, scan.state) for scan in scans]
 
     def until_told(self, model_id: UUID, words: str) -> JobRecord:
         """The model once its progress says this."""
-        return until_told(self.models, model_id, words)
-
-
-def _look(known: threading.Event) -> Job:
-    """Opens the rig, so that it is known what it can do."""
-
-    def work(held: RigSession, _: Job) -> None:
-        held.open()
-
-    return Job(uuid4(), Holder("look", "look", None), utc_now(), work, lambda _: known.set())
+        return until_told(self.store, model_id, words)
 
 
 @pytest.fixture
@@ -305,13 +294,13 @@ def test_all_views_are_shot_around_the_table_and_the_model_is_made_of_them(shoot
     model_id = started(shooting, shoot_plan(exposure_s=0.02))
     made = shooting.over(model_id)
     assert (made.state, made.label, shooting.shot) == (JobState.SUCCEEDED, "cup", [0.0, 90.0, 180.0, 270.0])
-    scans = shooting.runner.series(model_id)
+    scans = series(shooting.store, model_id)
     assert {each.label for each in scans} == {"cup"}
     assert {scan_plan_from_json(each.plan).exposure_s for each in scans} == {0.02}
     used = plan_from_json(made.plan)
     assert used.scans == tuple(each.id for each in scans)
     assert used.poses == TurntablePoses(AXIS, (0.0, 90.0, 180.0, 270.0))
-    told = [event.data for event in shooting.models.events(model_id, after=0)]
+    told = [event.data for event in shooting.store.events(model_id, after=0)]
     assert [each["state"] for each in told if "time" in each] == ["queued", "capturing", "computing", "succeeded"]
     details = [each["detail"] for each in told if each.get("stage") == "view"]
     # Progress of a view that is computed comes while the next is shot; that may have ended, too, on a busy machine.
@@ -331,7 +320,7 @@ def test_last_view_that_ends_before_its_progress_is_recorded_is_no_first_one(
     shoot = plan_from_json(shooting.over(model_id).plan).shoot
     assert shoot is not None
     told: list[JobProgress] = []
-    monkeypatch.setattr(shooting.desk.jobs, "progress", lambda _, progress: told.append(progress))
+    monkeypatch.setattr(shooting.store, "progress", lambda _, progress: told.append(progress))
     shooting.shooting._tell(model_id, shoot)
     assert [each.detail for each in told] == ["view 4 of 4"]
 
@@ -376,14 +365,14 @@ def test_a_cancelled_model_takes_its_waiting_views_with_it(shooting: ShootingBen
         shooting.shooting.shoot_view(model_id, again=True, wait=True)
     with (
         pytest.raises(ScanStateError, match=f"needed by model {model_id}"),
-        shooting.desk.unused(shooting.runner.series(model_id)[3].id),
+        shooting.models.unused(series(shooting.store, model_id)[3].id),
     ):
         pass
     assert shooting.shooting.cancel(model_id).state is JobState.CANCELLED
-    ended = [shooting.until(scan.id).state for scan in shooting.runner.series(model_id)]
+    ended = [shooting.until(scan.id).state for scan in series(shooting.store, model_id)]
     assert (ended, shooting.shot) == ([JobState.CANCELLED] * 4, [0.0])
     assert shooting.shooting.cancel(model_id).state is JobState.CANCELLED
-    assert shooting.models.unfinished() == []
+    assert shooting.store.unfinished(JobKind.MODEL) == []
 
 
 def test_what_cannot_be_shot_is_refused_and_nothing_is_on_record(tmp_path: Path) -> None:
@@ -395,7 +384,7 @@ def test_what_cannot_be_shot_is_refused_and_nothing_is_on_record(tmp_path: Path)
     bench.held()
     with pytest.raises(RigBusyError):
         started(bench, shoot_plan(manual=True))
-    assert bench.models.states() == {}
+    assert bench.store.states(JobKind.MODEL) == {}
     for wrong in (1, 73):
         with pytest.raises(ConfigError, match=f"views: expected 2 to 72, found {wrong}"):
             ShootPlan(wrong)
@@ -438,7 +427,7 @@ def test_by_hand_each_view_waits_for_a_person_and_the_last_may_be_shot_again(tmp
     made = bench.over(model_id)
     assert (made.state, bench.shot) == (JobState.SUCCEEDED, [0.0, 120.0, 120.0, 120.0, 240.0])
     # The newest that succeeded counts.
-    scans = bench.runner.series(model_id)
+    scans = series(bench.store, model_id)
     assert plan_from_json(made.plan).scans == (scans[0].id, scans[3].id, scans[4].id)
     with pytest.raises(ScanStateError, match=f"Model {model_id} is succeeded"):
         bench.shooting.shoot_view(model_id, again=True, wait=False)
@@ -450,7 +439,7 @@ def killed(root: Path, leave: Callable[[ShootingBench, UUID], None], *, manual: 
     bench = ShootingBench(root, start=False)
     bench.store.after_end = lambda _: None
     plan = shoot_plan(manual=manual)
-    model_id = bench.models.create(plan_json(plan), rig="bench", label="cup").id
+    model_id = bench.store.create(plan_json(plan), kind=JobKind.MODEL, rig="bench", label="cup").id
     leave(bench, model_id)
     bench.close()
     return model_id
@@ -462,14 +451,12 @@ def view(bench: ShootingBench, model_id: UUID, number: int, state: JobState, *, 
     document = scan_plan_json(plan)
     if state is JobState.SUCCEEDED:
         scan_id = kept_scan(bench.store, bench.folder)
+        kept = bench.store.get(scan_id)
         bench.store.delete(scan_id)
         summary = {} if count is None else {"turntable": {"count": count}}
-        bench.store.restore(
-            scan_id, document, summary, rig="bench", label="cup", created_at=utc_now(), started_at=utc_now(),
-            parent=model_id,
-        )  # fmt: skip
+        bench.store.restore(replace(kept, plan=document, summary=summary, label="cup", parent=model_id))
         return scan_id
-    [record] = bench.store.create_series([document], rig="bench", label="cup", parent=model_id)
+    record = bench.store.create(document, kind=JobKind.SCAN, rig="bench", label="cup", parent=model_id)
     if state is not JobState.QUEUED:
         bench.store.advance(record.id, state)
     return record.id
@@ -482,7 +469,7 @@ def left(*states: JobState, count: str | None = None) -> Callable[[ShootingBench
         for number, state in enumerate(states, start=1):
             view(bench, model_id, number, state, count=count)
         if states:
-            bench.models.advance(model_id, JobState.CAPTURING)
+            bench.store.advance(model_id, JobState.CAPTURING)
 
     return leave
 
@@ -493,16 +480,16 @@ all_shot, between_views = left(DONE, DONE, DONE, DONE), left(DONE, QUEUED, QUEUE
 
 def named(bench: ShootingBench, model_id: UUID) -> None:
     all_shot(bench, model_id)
-    plan = plan_from_json(bench.models.get(model_id).plan)
-    scans = tuple(scan.id for scan in bench.store.of(model_id)[model_id])
-    bench.models.replan(
-        model_id, plan_json(bench.desk.settled(replace(plan, scans=scans, poses=GivenPoses((STILL,) * 4))))
+    plan = plan_from_json(bench.store.get(model_id).plan)
+    scans = tuple(scan.id for scan in bench.store.of(model_id))
+    bench.store.replan(
+        model_id, plan_json(bench.models.settled(replace(plan, scans=scans, poses=GivenPoses((STILL,) * 4))))
     )
 
 
 def combining(bench: ShootingBench, model_id: UUID) -> None:
     named(bench, model_id)
-    bench.models.advance(model_id, JobState.COMPUTING)
+    bench.store.advance(model_id, JobState.COMPUTING)
 
 
 @pytest.mark.parametrize(
@@ -540,7 +527,7 @@ def test_after_a_kill_a_model_by_hand_waits_where_it_was(
     def leave(bench: ShootingBench, model_id: UUID) -> None:
         if first_was_shot:
             view(bench, model_id, 1, JobState.SUCCEEDED)
-            bench.models.advance(model_id, JobState.CAPTURING)
+            bench.store.advance(model_id, JobState.CAPTURING)
 
     model_id = killed(tmp_path, leave, manual=True)
     bench = ShootingBench(tmp_path, table=False)
@@ -555,11 +542,11 @@ def test_after_a_kill_a_model_by_hand_waits_where_it_was(
 def test_a_cancellation_that_was_cut_off_is_completed_at_the_next_start(tmp_path: Path) -> None:
     def cancelled(bench: ShootingBench, model_id: UUID) -> None:
         between_views(bench, model_id)
-        bench.models.finish(model_id, JobState.CANCELLED)
+        bench.store.finish(model_id, JobState.CANCELLED)
 
     model_id = killed(tmp_path, cancelled)
     bench = ShootingBench(tmp_path)
-    ended = [bench.until(scan.id).state for scan in bench.runner.series(model_id)]
+    ended = [bench.until(scan.id).state for scan in series(bench.store, model_id)]
     assert ended == [JobState.SUCCEEDED, *[JobState.CANCELLED] * 3]
     bench.close()
 
@@ -567,11 +554,15 @@ def test_a_cancellation_that_was_cut_off_is_completed_at_the_next_start(tmp_path
 def test_a_disk_that_refuses_the_scans_fails_their_model(
     shooting: ShootingBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(*_: object, **__: object) -> None:
+    real = shooting.store.create_all
+
+    def refused(*given: Any, kind: JobKind, **how: Any) -> Any:
+        if kind is JobKind.MODEL:
+            return real(*given, kind=kind, **how)
         message = "the disk is full"
         raise StorageError(message)
 
-    monkeypatch.setattr(shooting.store, "create_series", refused)
+    monkeypatch.setattr(shooting.store, "create_all", refused)
     with pytest.raises(StorageError, match="full"):
         started(shooting)
-    assert list(shooting.models.states().values()) == [JobState.FAILED]
+    assert list(shooting.store.states(JobKind.MODEL).values()) == [JobState.FAILED]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import gc
 import hashlib
-import importlib
 import os
 import re
 import signal
@@ -48,22 +47,21 @@ from slrig.errors import (
     WorkerLostError,
 )
 from slrig.jobs.frame_feed import FrameFeed
+from slrig.jobs.job import JobRun
 from slrig.jobs.versions import versions
 from slrig.jobs.worker import READY
 from slrig.jobs.worker_process import Task
 from slrig.model import Region
-from slrig.scan.job import reconstruction
-from slrig.scan.plan import ReconstructionPlan
 from tests.listening import listening_at
 from tests.unit.command import slrig
-
-PIPELINE = "tests.unit.scan.fake_pipeline"
+from tests.unit.scan import fake_pipeline
+from tests.unit.scan.fakes import reconstruction
 
 
 class TameWorker:
     """`Compute` in this process. done : the tasks that it was given."""
 
-    module, condition, loading = PIPELINE, READY, False
+    condition, loading = READY, False
 
     def __init__(self) -> None:
         self.done: list[Task] = []
@@ -80,9 +78,6 @@ class TameWorker:
         self.feeds.append(FrameFeed(lambda _: True, receiver=self, region=region))
         return self.feeds[-1]
 
-    def task(self, function: str, what: str) -> Callable[..., Any]:
-        return lambda *given: self.run(Task(function, given, what=what))
-
     def run(
         self,
         task: Task,
@@ -96,9 +91,11 @@ class TameWorker:
         if self.closed:
             raise ScanInterruptedError("closed")
         self.done.append(task)
-        module, name = task.function.split(":")
-        told = {"progress": progress, "cancelled": cancelled, "made": made} if task.movable else {}
-        return getattr(importlib.import_module(module), name)(*task.given, **task.options, **told)
+        files = task.files
+        if files is None:
+            return task.function(*task.given)
+        run = JobRun(files.id, files.folder, files.place, progress, cancelled, made, pipeline=fake_pipeline)
+        return task.function(run)
 
 
 class TameOrder(Future[PoolResponse]):
@@ -174,12 +171,11 @@ def lost(_order: PoolRequest) -> PoolResponse | None:
 
 def job(folder: Path, order: str = "finish") -> Task:
     """The reconstruction of a bundle that says what is to be done: see `tests.unit.scan.fake_pipeline`."""
-    bundle, result = folder / "staged" / "bundle", folder / "staged" / "result"
+    bundle = folder / "staged" / "bundle"
     (bundle / "frames").mkdir(parents=True)
-    result.mkdir()
     (bundle / "order").write_text(order)
     (bundle / "frames" / "0.png").write_bytes(bytes(range(256)) * 100)
-    return reconstruction(PIPELINE, bundle, result, ReconstructionPlan())
+    return reconstruction(folder / "staged")
 
 
 ADDRESS = "tls://pool:8786"
@@ -345,18 +341,18 @@ def pool() -> Pool:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in (folder / "staged" / "result").iterdir()}
+    return {path.name: path.read_bytes() for path in (folder / "staged" / "result").glob("*")}
 
 
 def test_the_pool_gives_what_this_machine_gives(pool: Pool, tmp_path: Path) -> None:
     made: list[str] = []
-    report = pool.worker.run(job(tmp_path / "pooled"), made=made.append)
+    found = pool.worker.run(job(tmp_path / "pooled"), made=made.append)
     pool.local.run(job(tmp_path / "local"))
     pooled, local = files(tmp_path / "pooled"), files(tmp_path / "local")
     # The tame report names the folder.
     assert {**pooled, "report.json": b""} == {**local, "report.json": b""}
     assert set(made) == files(tmp_path / "pooled").keys() == FILES
-    assert report["seconds"] == 1.5
+    assert found.summary["seconds"] == 1.5
     assert pool.remote.done[-1].where == {"where": "pool"}
     assert [told["stage"] for told in pool.cluster.told if "stage" in told] == ["decode", "done"]
     assert pool.cluster.orders[0].cancelled()
@@ -442,8 +438,7 @@ def test_what_the_pool_fails_to_do_this_machine_does(
     pool: Pool, tmp_path: Path, fault: Callable[[Pool], None], orders: int, because: str
 ) -> None:
     fault(pool)
-    report = pool.worker.run(job(tmp_path))
-    assert report["seconds"] == 1.5
+    assert pool.worker.run(job(tmp_path)).summary["seconds"] == 1.5
     assert files(tmp_path).keys() == FILES
     (done,) = pool.local.done
     assert done.where["where"] == "local"
@@ -454,7 +449,7 @@ def test_what_the_pool_fails_to_do_this_machine_does(
 
 def test_a_job_that_was_lost_is_given_to_the_pool_again(pool: Pool, tmp_path: Path) -> None:
     pool.cluster.acts = [lost]
-    assert pool.worker.run(job(tmp_path))["seconds"] == 1.5
+    assert pool.worker.run(job(tmp_path)).summary["seconds"] == 1.5
     assert (len(pool.cluster.orders), len(pool.remote.done), pool.local.done) == (2, 2, [])
     assert pool.tidied() == {f"stops/{pool.cluster.orders[0].order.job}"}
 
@@ -487,7 +482,7 @@ def test_frames_that_were_taken_here_are_computed_here(pool: Pool, tmp_path: Pat
 
 
 def test_workers_of_other_versions_are_not_used_nor_those_of_a_pool_for_other_tasks(pool: Pool) -> None:
-    assert pool.worker.task("tests.unit.scan.fake_pipeline:process_id", "examination")() > 0
+    assert pool.worker.run(Task(fake_pipeline.process_id, what="examination")) > 0
     assert len(pool.local.done) == 1
     cluster = DaskCluster("tcp://127.0.0.1:1", None)
     mine, newer = ({"resources": {resource(found): 1}} for found in (versions(), {**versions(), "code": "0"}))
@@ -539,8 +534,8 @@ def test_a_disk_that_is_full_is_no_fault_of_the_pool(
 
 def order(pool: Pool, folder: Path, what: str = "finish") -> PoolRequest:
     task = job(folder, what)
-    key = pool.store.put_bundle(task.given[0], lambda: None)
-    return PoolRequest("job", key, replace(task, given=task.given[2:]), "rig", versions())
+    key = pool.store.put_bundle(folder / "staged" / "bundle", lambda: None)
+    return PoolRequest("job", key, task, "rig", versions())
 
 
 def fault(answer: PoolResponse) -> tuple[str, str]:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import itertools
+import math
 import threading
+import time
 from collections.abc import Callable
-from functools import partial
 from importlib import import_module
 from typing import Any
 
-from slrig.errors import ScanCancelledError
+from slrig.errors import ScanCancelledError, WorkerBusyError
 from slrig.failure import interruption_error
 from slrig.jobs.frame_feed import FedCaptures, FrameFeed
-from slrig.jobs.worker import READY, Worker
+from slrig.jobs.job import JobRun
+from slrig.jobs.worker import READY
 from slrig.jobs.worker_process import Task
 from slrig.model import Region
 from tests.unit.scan.fakes import WAIT_S
@@ -21,22 +23,21 @@ Cancelled = Callable[[], bool]
 
 
 class TameCompute:
-    """Computes without a process of its own. Only `task` gives functions that are done in one, by a real worker.
+    """Computes without a process of its own.
 
-    module : as of a worker, `tests.unit.scan.fake_pipeline`. before : called at the beginning of each task.
+    module : as of a worker, `tests.unit.scan.fake_pipeline`. before : called at the beginning of each job.
     """
 
     condition, loading = READY, False
 
     def __init__(self, module: str, before: Callable[[Cancelled], object] = lambda _: None) -> None:
-        self.module = module
         self._pipeline = import_module(module)
         self._before = before
         self._captures = FedCaptures(self._pipeline.frame_receiver)
         self._numbers = itertools.count(1)
+        self.jobs = 0
         self._turn = threading.Lock()
         self._closed = threading.Event()
-        self._apart = Worker(module)
 
     def start(self) -> None:
         """It is ready."""
@@ -60,32 +61,50 @@ class TameCompute:
         feed: FrameFeed | None = None,
         within_s: float | None = None,
     ) -> Any:
-        del within_s
-
         def told(stage: str, fraction: float, detail: str) -> None:
             if self._closed.is_set():
                 raise interruption_error()
             progress(stage, fraction, detail)
 
+        self.jobs += 1
+        try:
+            self._take_turn(task, cancelled, within_s)
+            try:
+                return self._done(task, told, cancelled, made, feed)
+            finally:
+                self._turn.release()
+        finally:
+            self.jobs -= 1
+
+    def _take_turn(self, task: Task, cancelled: Cancelled, within_s: float | None) -> None:
+        until_s = math.inf if within_s is None else time.monotonic() + within_s
         while not self._turn.acquire(timeout=0.01):
             if self._closed.is_set():
                 raise interruption_error()
             if cancelled():
                 raise ScanCancelledError(f"The {task.what} was cancelled.")
-        try:
-            self._before(cancelled)
-            whole = feed is not None and feed.settled(WAIT_S) and feed.whole
-            live = self._captures.taken(feed.number) if feed is not None and whole else None
-            function = getattr(self._pipeline, task.function.partition(":")[2])
-            return partial(function, *task.given, **task.options)(
-                progress=told, cancelled=cancelled, made=made, live=live
-            )
-        finally:
-            self._turn.release()
+            if time.monotonic() > until_s:
+                raise WorkerBusyError(f"Another job is computed, and the {task.what} has to wait. Ask again.")
 
-    def task(self, function: str, what: str) -> Callable[..., Any]:
-        return self._apart.task(function, what)
+    def _done(
+        self,
+        task: Task,
+        told: Callable[[str, float, str], None],
+        cancelled: Cancelled,
+        made: Callable[[str], None],
+        feed: FrameFeed | None,
+    ) -> Any:
+        files = task.files
+        if files is None:
+            return task.function(*task.given)
+        self._before(cancelled)
+        whole = feed is not None and feed.settled(WAIT_S) and feed.whole
+        live = self._captures.taken(feed.number) if feed is not None and whole else None
+        run = JobRun(
+            files.id, files.folder, files.place, told, cancelled, made,
+            live=live, evidence=files.evidence, where=task.where, pipeline=self._pipeline,
+        )  # fmt: skip
+        return task.function(run)
 
     def close(self) -> None:
         self._closed.set()
-        self._apart.close()

@@ -3,36 +3,42 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import stat
 import subprocess
 import sys
 import threading
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from uuid import UUID, uuid4
 
 import pytest
+from structlog.testing import capture_logs
 
-from slrig.api.server import ADDRESS_FILE
+from slrig.api.server import ADDRESS_FILE, KINDS
+from slrig.devices import Rig
 from slrig.doctor.doctor import Diagnosis
 from slrig.doctor.light import fault, ok
-from slrig.errors import DataFolderGoneError, StorageError
+from slrig.errors import DataFolderGoneError, DeviceGoneError, StorageError
 from slrig.failure import disk_errors
 from slrig.jobs import backup
 from slrig.jobs.backup import back_up, read_manifest, restore
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.examinations import keep, last_examination
-from slrig.jobs.records import JobKind, JobState, utc_now
+from slrig.jobs.manager import JobManager
+from slrig.jobs.records import JobKind, JobRecord, JobState, utc_now, write_record
+from slrig.jobs.resume import resume
 from slrig.jobs.store import JobStore
+from slrig.rig.session import RigSession
 from slrig.scan.plan import ScanPlan
-from slrig.scan.records import KeptRecord, plan_from_json, plan_json, write_record
-from slrig.scan.sweep import sweep
-from tests.unit.scan.bench import failure_code
+from slrig.scan.records import plan_from_json, plan_json
+from tests.unit.jobs.tame_compute import TameCompute
+from tests.unit.scan.bench import PIPELINE, failure_code
 
 
 @pytest.fixture
@@ -44,15 +50,35 @@ def folder(tmp_path: Path) -> Iterator[DataFolder]:
 
 @pytest.fixture
 def store(folder: DataFolder) -> Iterator[JobStore]:
-    store = JobStore(Database(folder.database), JobKind.SCAN)
+    store = JobStore(Database(folder.database))
     yield store
     store.database.close()
 
 
 def running(store: JobStore, state: JobState) -> UUID:
-    scan = store.create(plan_json(ScanPlan()), rig="bench", label=None)
-    store.advance(scan.id, state)
-    return scan.id
+    scan = waiting(store)
+    store.advance(scan, state)
+    return scan
+
+
+def waiting(store: JobStore) -> UUID:
+    return store.create(plan_json(ScanPlan()), kind=JobKind.SCAN, rig="bench").id
+
+
+def settled(store: JobStore, folder: DataFolder) -> dict[str, set[str]]:
+    """What the start of a service finds: the jobs, or the files, by what it says of them."""
+
+    def no_rig() -> Rig:
+        raise DeviceGoneError("not plugged in")
+
+    manager = JobManager(store, folder, RigSession("bench", no_rig), TameCompute(PIPELINE), *KINDS)
+    with capture_logs() as logs:
+        resume(manager)
+    found: dict[str, set[str]] = defaultdict(set)
+    for each in logs:
+        if each["event"] == "left by the last run":
+            found[each["found"]].add(each.get("job") or each["files"])
+    return found
 
 
 def staged_bundle(folder: DataFolder, scan_id: UUID) -> Path:
@@ -96,10 +122,16 @@ def test_released_folder_may_be_taken_again(folder: DataFolder) -> None:
     DataFolder(folder.root).release()
 
 
-def finished(folder: DataFolder, scan_id: UUID) -> None:
-    folder.scan(scan_id).mkdir()
-    (folder.scan(scan_id) / "mesh.ply").write_bytes(b"ply")
-    (folder.scan(scan_id) / "report.json").write_text(json.dumps({"truth": {"rms_mm": 0.01}, "stages": []}))
+SUMMARY = {"truth": {"rms_mm": 0.01}}
+
+
+def finished(folder: DataFolder, record: JobRecord) -> None:
+    """The files of a scan that has come to its end."""
+    place = folder.scan(record.id)
+    place.mkdir()
+    (place / "mesh.ply").write_bytes(b"ply")
+    (place / "report.json").write_text("{}")
+    write_record(place, replace(record, state=JobState.SUCCEEDED, summary=SUMMARY))
 
 
 def test_space_is_asked_for_before_a_scan(tmp_path: Path) -> None:
@@ -118,9 +150,10 @@ def test_each_file_of_a_scan_is_brought_to_disk_once(folder: DataFolder, monkeyp
     recording.mkdir()
     (recording / "000.png").write_bytes(b"frame")
     folder.keep_recording(scan_id)
-    result = folder.stage_result(scan_id)
+    result = folder.result(scan_id)
+    result.mkdir()
     (result / "mesh.ply").write_bytes(b"mesh")
-    folder.commit(scan_id)
+    folder.put(scan_id, folder.scan(scan_id))
     files = (recording / "000.png", staged / "mesh.ply")
     assert [synced.count(path) for path in (*files, recording, folder.scans)] == [1, 1, 1, 1]
     # The bundle's name, and then those of the results.
@@ -134,7 +167,7 @@ def test_committed_scan_has_its_results_beside_its_bundle(folder: DataFolder) ->
     result = folder.staging(scan_id) / "result"
     result.mkdir()
     (result / "mesh.ply").write_bytes(b"ply")
-    folder.commit(scan_id)
+    folder.put(scan_id, folder.scan(scan_id))
     assert {path.name for path in folder.scan(scan_id).iterdir()} == {"bundle", "mesh.ply"}
     assert list(folder.incoming.iterdir()) == []
 
@@ -150,7 +183,7 @@ def test_refusal_of_the_disk_names_the_place_and_the_remedy_and_other_errors_pas
 
 
 @pytest.mark.parametrize("state", [JobState.CAPTURING, JobState.COMPUTING])
-def test_sweep_records_a_cut_off_capture_as_interrupted_and_clears_its_files(
+def test_start_records_a_cut_off_capture_as_interrupted_and_clears_its_files(
     store: JobStore, folder: DataFolder, state: JobState
 ) -> None:
     scan_id = running(store, state)
@@ -160,111 +193,111 @@ def test_sweep_records_a_cut_off_capture_as_interrupted_and_clears_its_files(
         # Killed between the light and the end of the recording: its frames are not all on the disk.
         folder.stage(scan_id)
         folder.recording(scan_id).mkdir()
-    swept = sweep(store, folder)
-    assert swept.interrupted == (scan_id,)
+    assert settled(store, folder) == {"interrupted": {str(scan_id)}}
     record = store.get(scan_id)
     assert (record.state, failure_code(record)) == (JobState.INTERRUPTED, "scan-interrupted")
     assert not folder.scan(scan_id).exists()
     assert list(folder.incoming.iterdir()) == []
 
 
-def test_sweep_leaves_what_the_runner_takes_up_again(store: JobStore, folder: DataFolder) -> None:
+def test_what_waits_or_computes_goes_on(store: JobStore, folder: DataFolder) -> None:
     cut_off = running(store, JobState.COMPUTING)
     staged_bundle(folder, cut_off)
-    queued = store.create(plan_json(ScanPlan()), rig="bench", label=None).id
-    swept = sweep(store, folder)
-    assert (swept.resumed, swept.interrupted) == ((cut_off, queued), ())
+    queued = waiting(store)
+    assert settled(store, folder) == {"taken up again": {str(cut_off), str(queued)}}
     assert [record.id for record in store.unfinished()] == [cut_off, queued]
     assert (folder.staging(cut_off) / "bundle").is_dir()
 
 
-def test_sweep_keeps_the_whole_bundle_of_a_reconstruction_that_was_cut_off_twice(
+def test_start_keeps_the_whole_bundle_of_a_reconstruction_that_was_cut_off_twice(
     store: JobStore, folder: DataFolder
 ) -> None:
     scan_id = running(store, JobState.COMPUTING)
     store.advance(scan_id, JobState.COMPUTING)
     staged_bundle(folder, scan_id)
     (folder.staging(scan_id) / "result.part").mkdir()
-    sweep(store, folder)
+    settled(store, folder)
     assert store.get(scan_id).state is JobState.INTERRUPTED
     assert [path.name for path in folder.scan(scan_id).iterdir()] == ["bundle"]
 
 
 @pytest.mark.parametrize("whole", [True, False])
-def test_sweep_recognises_a_scan_that_lacked_only_its_last_record(
+def test_start_recognises_a_scan_that_lacked_only_its_last_record(
     store: JobStore, folder: DataFolder, whole: bool
 ) -> None:
     scan_id = running(store, JobState.COMPUTING)
-    finished(folder, scan_id)
+    finished(folder, store.get(scan_id))
     if not whole:
         (folder.scan(scan_id) / "mesh.ply").unlink()
-    swept = sweep(store, folder)
-    assert (swept.recovered, swept.interrupted) == (((scan_id,), ()) if whole else ((), (scan_id,)))
+    assert settled(store, folder) == {"recovered" if whole else "interrupted": {str(scan_id)}}
     assert store.get(scan_id).state is (JobState.SUCCEEDED if whole else JobState.INTERRUPTED)
-    assert store.get(scan_id).summary == ({"truth": {"rms_mm": 0.01}} if whole else None)
+    assert store.get(scan_id).summary == (SUMMARY if whole else None)
 
 
-def test_sweep_completes_a_deletion_that_was_cut_off(store: JobStore, folder: DataFolder) -> None:
+def test_start_completes_a_deletion_that_was_cut_off(store: JobStore, folder: DataFolder) -> None:
     scan_id = running(store, JobState.COMPUTING)
-    finished(folder, scan_id)
+    finished(folder, store.get(scan_id))
     store.finish(scan_id, JobState.SUCCEEDED)
-    folder.withdraw(scan_id)
-    sweep(store, folder)
+    folder.withdraw(folder.scan(scan_id), scan_id)
+    settled(store, folder)
     assert scan_id not in store.states()
     assert list(folder.incoming.iterdir()) == []
 
 
 @pytest.mark.parametrize("gone", [("mesh.ply",), ("report.json",), ("mesh.ply", "report.json")])
-def test_sweep_says_when_the_files_of_a_scan_are_gone(
+def test_start_says_when_the_files_of_a_scan_are_gone(
     store: JobStore, folder: DataFolder, gone: tuple[str, ...]
 ) -> None:
     scan_id = running(store, JobState.COMPUTING)
     store.finish(scan_id, JobState.SUCCEEDED)
-    finished(folder, scan_id)
+    finished(folder, store.get(scan_id))
     for name in gone:
         (folder.scan(scan_id) / name).unlink()
-    assert sweep(store, folder).lost == (scan_id,)
+    assert settled(store, folder) == {"without files": {str(scan_id)}}
     record = store.get(scan_id)
     assert record.state is JobState.FAILED
     assert record.fault is not None
-    assert record.fault.message.startswith(f"{' and '.join(gone)} of this scan is gone")
+    assert record.fault.message.startswith(f"{' and '.join(gone)} of this reconstruction is gone")
 
 
-def test_sweep_puts_finished_scans_on_record_again_beside_a_database_that_was_lost(
+def test_start_puts_finished_scans_on_record_again_beside_a_database_that_was_lost(
     store: JobStore, folder: DataFolder
 ) -> None:
-    plan = ScanPlan(exposure_s=0.02)
-    made = datetime(2026, 11, 23, 12, 0, tzinfo=UTC)
-    records = [KeptRecord(uuid4(), "bench", f"part {i}", plan, made - timedelta(hours=i), made) for i in range(3)]
+    plan, made = ScanPlan(exposure_s=0.02), datetime(2026, 11, 23, 12, 0, tzinfo=UTC)
+    for i in range(3):
+        store.create(plan_json(plan), kind=JobKind.SCAN, rig="bench", label=f"part {i}")
+    records = [
+        replace(record, created_at=made - timedelta(hours=i), started_at=made)
+        for i, record in enumerate(store.unfinished())
+    ]
     for record in records:
-        finished(folder, record.id)
-        write_record(folder.scan(record.id), record)
+        finished(folder, record)
+        store.delete(record.id)
     (folder.scan(records[1].id) / "mesh.ply").unlink()
-    swept = sweep(store, folder)
-    assert set(swept.recovered) == {records[0].id, records[2].id}
-    assert swept.put_aside == (str(records[1].id),)
+    assert settled(store, folder) == {
+        "recovered": {str(records[0].id), str(records[2].id)}, "put aside": {str(records[1].id)},
+    }  # fmt: skip
     newest, oldest = store.page(before=None, limit=10)
     assert (newest.id, oldest.id) == (records[0].id, records[2].id)
     assert (newest.state, newest.label, newest.created_at) == (JobState.SUCCEEDED, "part 0", made)
     assert plan_from_json(newest.plan) == plan
-    assert newest.summary == {"truth": {"rms_mm": 0.01}}
+    assert newest.summary == SUMMARY
     assert [event.kind for event in store.events(newest.id, after=0)] == ["state"]
-    assert sweep(store, folder).recovered == ()
+    assert settled(store, folder) == {}
 
 
-def test_sweep_of_a_sound_folder_changes_nothing_and_puts_files_without_a_record_aside(
+def test_start_of_a_sound_folder_changes_nothing_and_puts_files_without_a_record_aside(
     store: JobStore, folder: DataFolder
 ) -> None:
     scan_id = running(store, JobState.COMPUTING)
-    finished(folder, scan_id)
+    finished(folder, store.get(scan_id))
     store.finish(scan_id, JobState.SUCCEEDED)
     before = store.get(scan_id)
-    swept = sweep(store, folder)
-    assert (swept.interrupted, swept.recovered, swept.lost, swept.put_aside) == ((), (), (), ())
+    assert settled(store, folder) == {}
     stray = folder.scans / "somebody"
     stray.mkdir()
     (stray / "mesh.ply").write_bytes(b"work")
-    assert sweep(store, folder).put_aside == ("somebody",)
+    assert settled(store, folder) == {"put aside": {"somebody"}}
     assert (folder.orphans / "somebody" / "mesh.ply").read_bytes() == b"work"
     assert store.get(scan_id) == before
 
@@ -308,7 +341,7 @@ def test_links_in_the_data_folder_are_neither_followed_nor_fatal(
     (staged_bundle(folder, cut) / "frame.png").symlink_to(elsewhere / "absent")
     store.advance(cut, JobState.COMPUTING)
     stray, linked, hollow = uuid4(), running(store, JobState.COMPUTING), running(store, JobState.COMPUTING)
-    write_record(elsewhere, KeptRecord(stray, "bench", None, ScanPlan(), datetime.now(UTC), datetime.now(UTC)))
+    write_record(elsewhere, replace(store.get(cut), id=stray))
     folder.scan(stray).symlink_to(elsewhere)
     folder.scan(linked).symlink_to(elsewhere)
     store.finish(linked, JobState.SUCCEEDED)
@@ -316,11 +349,12 @@ def test_links_in_the_data_folder_are_neither_followed_nor_fatal(
     for name in ("mesh.ply", "report.json"):
         (folder.scan(hollow) / name).symlink_to(elsewhere / name)
     before = sorted(elsewhere.iterdir())
-    swept = sweep(store, folder)
+    found = settled(store, folder)
     assert list(folder.incoming.iterdir()) == []
     assert sorted(elsewhere.iterdir()) == before
-    assert (swept.lost, swept.recovered, swept.put_aside) == ((linked,), (), (str(stray),))
-    assert set(swept.interrupted) == {cut, hollow}
+    assert found == {
+        "without files": {str(linked)}, "put aside": {str(stray)}, "interrupted": {str(cut), str(hollow)},
+    }  # fmt: skip
     assert (folder.scan(cut) / "bundle" / "bundle.json").is_file()
 
 
@@ -388,7 +422,7 @@ def test_no_examination_is_kept_where_no_service_keeps_its_data_and_no_other_fil
 
 
 def scanned(store: JobStore, folder: DataFolder, state: JobState = JobState.SUCCEEDED) -> UUID:
-    scan = store.create(plan_json(ScanPlan()), rig="bench", label=None).id
+    scan = store.create(plan_json(ScanPlan()), kind=JobKind.SCAN, rig="bench", label=None).id
     if state.final:
         store.finish(scan, state)
     elif state is not JobState.QUEUED:
@@ -409,7 +443,7 @@ def restored(tmp_path: Path) -> Iterator[tuple[DataFolder, JobStore]]:
     """The data folder of a restored backup, and its records, as a service opens them."""
     restore(tmp_path / "backup", tmp_path / "elsewhere")
     folder = DataFolder(tmp_path / "elsewhere")
-    records = JobStore(Database(folder.database), JobKind.SCAN)
+    records = JobStore(Database(folder.database))
     yield folder, records
     records.database.close()
     folder.release()
@@ -445,8 +479,7 @@ def test_what_ended_comes_back_and_what_did_not_is_settled_as_cut_off(
         assert (other.root / "key.sha256").read_text() == "0123"
         assert (other.calibrations / "c1" / "poses").is_dir()
         # None of them begins by itself on the rig of whoever restores.
-        swept = sweep(records, other)
-        assert (set(swept.interrupted), swept.resumed, swept.lost, swept.put_aside) == (open_, (), (), ())
+        assert settled(records, other) == {"interrupted": set(map(str, open_))}
         assert records.states() == {
             **dict.fromkeys(ended, JobState.SUCCEEDED),
             failed: JobState.FAILED,
@@ -476,7 +509,7 @@ def test_a_scan_that_is_removed_meanwhile_is_left_out_and_said(
     tmp_path: Path, store: JobStore, folder: DataFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gone, stays = scanned(store, folder), scanned(store, folder)
-    while_copying(monkeypatch, "bundle.json", lambda: folder.withdraw(gone))
+    while_copying(monkeypatch, "bundle.json", lambda: folder.withdraw(folder.scan(gone), gone))
     manifest = back_up(folder.root, tmp_path / "backup")
     assert manifest.left_out == (f"scans/{gone}: was removed meanwhile",)
     assert not any(str(gone) in name for name in (*manifest.files, *manifest.folders))
@@ -516,7 +549,7 @@ def test_records_that_change_meanwhile_are_as_they_were_and_hold_up_nobody(
     assert back_up(folder.root, tmp_path / "backup").scans == 1
     with restored(tmp_path) as (other, records):
         assert list(records.states()) == [ended]
-        assert sweep(records, other).put_aside == ()
+        assert settled(records, other) == {}
 
 
 def test_unchanged_files_are_links_to_those_of_an_earlier_backup(

@@ -6,36 +6,32 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 from uuid import UUID
 
 import pytest
 
-from slrig.accept import running as acceptance
-from slrig.accept.desk import AcceptanceDesk
 from slrig.accept.evaluation import Reading
-from slrig.calibrate.calibrating import CalibrationSessions
-from slrig.calibrate.pose_shooting import PoseRequest
-from slrig.calibration.board import Board, PoseObservation
-from slrig.combine.desk import ModelDesk
+from slrig.accept.job import AcceptanceTests
+from slrig.accept.plan import Step
+from slrig.accept.store import points_file
+from slrig.calibrate.calibrating import Calibrations, PoseRequest
+from slrig.calibrate.verification import HealthStore, RigHealth, VerificationJob
+from slrig.combine.job import TURNTABLE, Models
 from slrig.combine.plan import ModelPlan, StatedAxis, TurntablePoses
 from slrig.combine.turntable import TurntableStore
 from slrig.errors import DeviceGoneError, OutOfMemoryError, RigBusyError, ScanCancelledError, ScanInterruptedError
 from slrig.jobs.records import JobKind, JobRecord, JobState
-from slrig.jobs.store import JobStore
 from slrig.rig.session import ActiveCalibration
-from slrig.verify.job import VerificationDesk
-from slrig.verify.store import HealthStore
-from slrig.verify.verification import VerificationTools
 from tests.unit.accept.test_plan import plan_of
 from tests.unit.calibrate.calibration_bench import BOARD, TameCalibrating, tame_calibration
+from tests.unit.calibrate.health_bench import a_verification
 from tests.unit.combine.model_bench import TameCombining, kept_scan
 from tests.unit.jobs.tame_compute import TameCompute
 from tests.unit.scan.bench import PIPELINE, Bench, failure_code
 from tests.unit.scan.fakes import WAIT_S
-from tests.unit.verify.health_bench import a_verification
+from tests.unit.stand_ins import stand_ins
 
 Cancelled = Callable[[], bool]
 
@@ -63,54 +59,32 @@ class Computing:
 class Service(Bench):
     """Everything that begins jobs, over one tame rig that is calibrated."""
 
-    def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.computing = computing = Computing()
-        super().__init__(root, worker=TameCompute(PIPELINE, before=computing))
-        self.tame = TameCalibrating(self)
-        tools = self.tame.tools()
+    def __init__(self, root: Path) -> None:
+        self.computing = Computing()
+        super().__init__(root, worker=TameCompute(PIPELINE, before=self.computing))
+        tame = TameCalibrating()
+        self.patched.enter_context(tame.patched())
 
-        def read(folder: Path, board: Board, name: str) -> Any:
-            computing()
-            return tools.read(folder, board, name)
-
-        def solve(*given: Any, **options: Any) -> Any:
-            computing()
-            return tools.solve(*given, **options)
-
-        def judge(poses: Sequence[Any], *_: object) -> Any:
-            assert isinstance(poses[0], PoseObservation)
-            return a_verification()
-
-        def combine(*given: Any, **options: Any) -> None:
-            computing(options["cancelled"])
-            TameCombining()(*given, **options)
-
-        def evaluate(*given: Any, cancelled: Cancelled, **_: Any) -> Reading:
-            computing(cancelled)
-            *_paths, step, take = given
+        def evaluate(_bundle: Path, folder: Path, _plan: object, step: Step, take: int, **_: Any) -> Reading:
+            points = folder / points_file(step.name, take)
+            points.parent.mkdir(parents=True, exist_ok=True)
+            points.touch()
             return Reading(step.name, take, {}, 0.01, 0.01, 0.04, 900, 0, 0.0)
 
-        monkeypatch.setattr(acceptance, "capture_frames", tools.capture)
-        database, queue = self.store.database, self.runner.queue
-        self.of_calibrations = JobStore(database, JobKind.POSE, JobKind.SOLVE)
-        self.calibrations = CalibrationSessions(
-            self.folder, self.runner, self.of_calibrations, rig_name="bench",
-            tools=replace(tools, read=read, solve=solve),
-        )  # fmt: skip
-        self.verifications = VerificationDesk(
-            self.folder, queue, HealthStore(database), JobStore(database, JobKind.VERIFICATION),
-            tools=VerificationTools(tools.capture, read, judge),
-        )  # fmt: skip
-        self.models = ModelDesk(
-            self.folder, queue, JobStore(database, JobKind.MODEL), scans=self.store, combine=combine,
-            turntable=TurntableStore(root / "turntable"), keep=100,
-        )  # fmt: skip
-        self.acceptance = AcceptanceDesk(
-            self.folder, queue, JobStore(database, JobKind.POSITION), evaluate=evaluate,
-            report=lambda *_: None,
-        )  # fmt: skip
-        self.runner.use_calibration(ActiveCalibration("spring", tame_calibration()))
-        self.runner.start()
+        functions = {
+            "calibration.health.verification.verify_by_board": lambda *_: a_verification(),
+            "combine.combining.combine_into": TameCombining(),
+            "accept.running.evaluated": evaluate,
+            "accept.job.write_test_report": lambda *_: None,
+        }
+        self.patched.enter_context(stand_ins(functions))
+        health = RigHealth(self.manager.rig, HealthStore(self.store.database), self.folder)
+        self.manager.groups[JobKind.VERIFICATION] = health
+        self.calibrations = Calibrations(self.manager)
+        self.models = Models(self.manager, turntable=TurntableStore(self.folder.root / TURNTABLE), keep=100)
+        self.acceptance = AcceptanceTests(self.manager)
+        self.manager.rig.use_calibration(ActiveCalibration("spring", tame_calibration()))
+        self.manager.start()
 
     def files(self) -> set[Path]:
         """All that lies in the data folder, but for the records' own files."""
@@ -124,13 +98,10 @@ class Service(Bench):
 class Kind:
     """How jobs of a kind are begun and cancelled. Each object stands for one.
 
-    captures : its first part holds the rig and takes frames. hears : its second part can be cancelled; else it is so
-    short that it comes to its end. holds : it has the rig while it computes, too. keeps : the frames stay where the
-    second part failed.
+    captures : its first part has the rig and takes frames. keeps : the frames stay where the second part failed.
     """
 
-    captures, hears, holds, keeps = True, False, False, False
-    jobs: JobStore
+    captures, keeps = True, False
 
     def __init__(self, service: Service) -> None:
         self.service = service
@@ -143,7 +114,7 @@ class Kind:
         raise NotImplementedError
 
     def cancel(self, job_id: UUID) -> None:
-        raise NotImplementedError
+        self.service.manager.cancel(job_id)
 
     def capturing(self) -> UUID:
         self.service.gate.clear()
@@ -158,38 +129,31 @@ class Kind:
         return job_id
 
     def over(self, job_id: UUID) -> JobRecord:
-        return self.service.until(job_id, jobs=self.jobs)
+        return self.service.until(job_id)
 
 
 class Scan(Kind):
     """A scan."""
 
-    hears = keeps = True
-
-    def prepare(self) -> None:
-        self.jobs = self.service.store
+    keeps = True
 
     def begin(self, *, wait: bool = False) -> UUID:
         return self.service.scan(wait=wait).id
-
-    def cancel(self, job_id: UUID) -> None:
-        self.service.runner.cancel(job_id)
 
 
 class Pose(Kind):
     """A pose of a calibration."""
 
     def prepare(self) -> None:
-        self.jobs = self.service.of_calibrations
         self.session = self.service.calibrations.open(BOARD).id
 
     def begin(self, *, wait: bool = False) -> UUID:
-        return self.service.calibrations.poses.shoot(self.session, PoseRequest(), wait=wait).id
+        return self.service.calibrations.shoot(self.session, PoseRequest(), wait=wait).id
 
     def cancel(self, job_id: UUID) -> None:
         poses = self.service.calibrations.register.get(self.session).poses
         number = next(pose.number for pose in poses if pose.id == job_id)
-        self.service.calibrations.poses.cancel(self.session, number)
+        self.service.calibrations.cancel(self.session, number)
 
 
 class Solve(Pose):
@@ -205,33 +169,26 @@ class Solve(Pose):
 
     def begin(self, *, wait: bool = False) -> UUID:
         del wait
-        self.service.calibrations.solves.solve(self.session)
-        return self.jobs.of(self.session)[self.session][-1].id
+        self.service.calibrations.solve(self.session)
+        return self.service.store.of(self.session)[-1].id
 
     def cancel(self, job_id: UUID) -> None:
-        self.service.calibrations.solves.work.cancel(job_id)
+        self.service.manager.cancel(job_id)
 
 
-class Verification(Kind):
+class Verified(Kind):
     """A verification."""
 
-    def prepare(self) -> None:
-        self.jobs = self.service.verifications.jobs
-
     def begin(self, *, wait: bool = False) -> UUID:
-        return self.service.verifications.shoot(BOARD, wait=wait).id
-
-    def cancel(self, job_id: UUID) -> None:
-        self.service.verifications.cancel(job_id)
+        return self.service.manager.submit(VerificationJob(BOARD), wait=wait)[0].id
 
 
 class Model(Kind):
     """A model of two scans."""
 
-    captures, hears = False, True
+    captures = False
 
     def prepare(self) -> None:
-        self.jobs = self.service.models.jobs
         self.scans = tuple(kept_scan(self.service.store, self.service.folder, angle_deg=each) for each in (0.0, 40.0))
 
     def begin(self, *, wait: bool = False) -> UUID:
@@ -239,17 +196,11 @@ class Model(Kind):
         plan = ModelPlan(self.scans, TurntablePoses(StatedAxis((4.0, 45.0, 12.0), (0.0, -1.0, 0.0))))
         return self.service.models.combine(plan).id
 
-    def cancel(self, job_id: UUID) -> None:
-        self.service.models.cancel(job_id)
-
 
 class Position(Kind):
     """One of an acceptance test, which is cancelled with it."""
 
-    hears = holds = True
-
     def prepare(self) -> None:
-        self.jobs = self.service.acceptance.jobs
         # A test is opened on a rig that is open.
         self.service.until(self.service.scan().id)
         self.service.began.clear()
@@ -263,16 +214,16 @@ class Position(Kind):
         return self.service.acceptance.measure(self.test, wait=wait, scripted=False).id
 
     def cancel(self, job_id: UUID) -> None:
-        assert job_id in {job.id for job in self.jobs.of(self.test)[self.test]}
+        assert job_id in {job.id for job in self.service.store.of(self.test)}
         self.service.acceptance.cancel(self.test)
 
 
-KINDS = (Scan, Pose, Solve, Verification, Model, Position)
+KINDS = (Scan, Pose, Solve, Verified, Model, Position)
 
 
 @pytest.fixture
-def service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Service]:
-    service = Service(tmp_path, monkeypatch)
+def service(tmp_path: Path) -> Iterator[Service]:
+    service = Service(tmp_path)
     yield service
     service.close()
 
@@ -293,7 +244,7 @@ capturing = parametrised([kind for kind in KINDS if kind.captures])
 
 def assert_well(service: Service, kind: Kind, *, opened: int = 1) -> None:
     """The rig is dark, free and open, and the next job of this kind succeeds."""
-    status = service.runner.status()
+    status = service.manager.status()
     assert (status.holder, status.fault) == (None, None)
     assert all(projector.dark for _, projector in service.opened)
     for each in (service.computing, service):
@@ -328,10 +279,10 @@ def test_a_job_that_is_cancelled_while_it_captures_leaves_nothing(service: Servi
     job_id = kind.capturing()
     with pytest.raises(RigBusyError) as busy:
         service.scan()
-    started = kind.jobs.get(job_id).started_at
+    started = service.store.get(job_id).started_at
     assert started is not None
     assert (busy.value.holder, busy.value.since) == (
-        service.runner.status().holder, started.isoformat(timespec="seconds"),
+        service.manager.status().holder, started.isoformat(timespec="seconds"),
     )  # fmt: skip
     assert "cancel it with POST /" in str(busy.value)
     assert not service.opened[0][1].dark
@@ -344,18 +295,16 @@ def test_a_job_that_is_cancelled_while_it_captures_leaves_nothing(service: Servi
 
 
 @every
-def test_a_job_that_is_cancelled_while_it_computes_ends_or_comes_to_its_end(service: Service, kind: Kind) -> None:
+def test_a_job_that_is_cancelled_while_it_computes_leaves_nothing(service: Service, kind: Kind) -> None:
     before = service.files()
     job_id = kind.computing()
-    assert (service.runner.status().holder is not None) is kind.holds
+    # Whatever computes leaves the rig to others.
+    assert service.manager.status().holder is None
     kind.cancel(job_id)
-    if not kind.hears:
-        service.computing.gate.set()
     record = kind.over(job_id)
-    assert record.state is (JobState.CANCELLED if kind.hears else JobState.SUCCEEDED)
+    assert record.state is JobState.CANCELLED
     assert list(service.folder.incoming.iterdir()) == []
-    if kind.hears:
-        assert service.files() == before
+    assert service.files() == before
     kind.cancel(job_id)
     assert kind.over(job_id) == record
     assert_well(service, kind)
@@ -388,7 +337,7 @@ def test_mathematics_that_fails_fails_the_job_alone(service: Service, kind: Kind
 def test_the_end_of_the_service_interrupts_what_captures_and_leaves_what_waits(service: Service, kind: Kind) -> None:
     job_id = kind.capturing()
     waiting = service.scan(wait=True)
-    service.runner.close(timeout_s=WAIT_S)
+    service.manager.close(timeout_s=WAIT_S)
     record = kind.over(job_id)
     assert (record.state, failure_code(record)) == (JobState.INTERRUPTED, "scan-interrupted")
     assert service.store.get(waiting.id).state is JobState.QUEUED

@@ -19,10 +19,9 @@ from slrig.jobs import versions as module
 from slrig.jobs.database import Database, sqlite_engine
 from slrig.jobs.keys import RequestKeys
 from slrig.jobs.progress import ProgressRecorder
-from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState
+from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, Stage, stages_of
 from slrig.jobs.store import JobStore
 from slrig.jobs.tables import Base
-from slrig.jobs.timeline import Stage, stages_of
 from slrig.scan.plan import PatternPlan, ScanPlan
 from slrig.scan.records import plan_from_json, plan_json
 from tests.unit.scan.fakes import SetClock
@@ -37,7 +36,7 @@ def clock() -> SetClock:
 
 @pytest.fixture
 def store(tmp_path: Path, clock: SetClock) -> Iterator[JobStore]:
-    store = JobStore(Database(tmp_path / "slrig.sqlite"), JobKind.SCAN, clock=clock)
+    store = JobStore(Database(tmp_path / "slrig.sqlite"), clock=clock)
     yield store
     store.database.close()
 
@@ -49,14 +48,14 @@ def keys(store: JobStore, clock: SetClock) -> RequestKeys:
 
 def test_scan_comes_back_as_it_was_recorded(store: JobStore, clock: SetClock) -> None:
     plan = ScanPlan(patterns=PatternPlan(line_shift_period_px=12, rows=True), exposure_s=0.02)
-    made = store.create(plan_json(plan), rig="bench", label="cup")
+    made = store.create(plan_json(plan), kind=JobKind.SCAN, rig="bench", label="cup")
     assert store.get(made.id) == made
     assert (plan_from_json(made.plan), made.label, made.rig, made.state) == (plan, "cup", "bench", JobState.QUEUED)
     assert made.created_at == clock.now
 
 
 def test_life_of_a_scan_is_told_by_its_events_in_order(store: JobStore, clock: SetClock) -> None:
-    scan = store.create(plan_json(ScanPlan()), rig="bench", label=None)
+    scan = store.create(plan_json(ScanPlan()), kind=JobKind.SCAN, rig="bench", label=None)
     clock.move(seconds=2)
     assert store.advance(scan.id, JobState.CAPTURING) == clock.now
     store.progress(scan.id, JobProgress("capture", 0.25, "frame 7 of 28"))
@@ -74,7 +73,7 @@ def test_life_of_a_scan_is_told_by_its_events_in_order(store: JobStore, clock: S
 
 
 def test_first_final_state_stands(store: JobStore) -> None:
-    scan = store.create(plan_json(ScanPlan()), rig="bench", label=None)
+    scan = store.create(plan_json(ScanPlan()), kind=JobKind.SCAN, rig="bench", label=None)
     assert store.finish(scan.id, JobState.SUCCEEDED, summary={"points": 3})
     assert not store.finish(scan.id, JobState.INTERRUPTED)
     assert store.get(scan.id).state is JobState.SUCCEEDED
@@ -82,16 +81,16 @@ def test_first_final_state_stands(store: JobStore) -> None:
 
 
 def test_pages_run_from_new_to_old_without_overlap(store: JobStore) -> None:
-    made = [store.create(plan_json(ScanPlan()), rig="bench", label=str(number)) for number in range(5)]
+    made = store.create_all([plan_json(ScanPlan())] * 5, kind=JobKind.SCAN, rig="bench")
     first = store.page(before=None, limit=3)
     second = store.page(before=first[-1].number, limit=3)
     assert [scan.id for scan in (*first, *second)] == [scan.id for scan in reversed(made)]
 
 
 def test_numbers_are_never_given_twice(store: JobStore) -> None:
-    gone = store.create(plan_json(ScanPlan()), rig="bench", label=None)
+    gone = store.create(plan_json(ScanPlan()), kind=JobKind.SCAN, rig="bench", label=None)
     store.delete(gone.id)
-    assert store.create(plan_json(ScanPlan()), rig="bench", label=None).number > gone.number
+    assert store.create(plan_json(ScanPlan()), kind=JobKind.SCAN, rig="bench", label=None).number > gone.number
     assert store.events(gone.id, after=0) == []
     with pytest.raises(JobNotFoundError, match=str(gone.id)):
         store.get(gone.id)
@@ -106,8 +105,8 @@ def test_unknown_scan_is_refused_everywhere(store: JobStore) -> None:
 
 
 def test_watcher_is_woken_by_its_scan_only_and_until_it_leaves(store: JobStore) -> None:
-    watched = store.create(plan_json(ScanPlan()), rig="bench", label=None)
-    other = store.create(plan_json(ScanPlan()), rig="bench", label=None)
+    watched = store.create(plan_json(ScanPlan()), kind=JobKind.SCAN, rig="bench", label=None)
+    other = store.create(plan_json(ScanPlan()), kind=JobKind.SCAN, rig="bench", label=None)
     calls: list[int] = []
     unwatch = store.watch(watched.id, lambda: calls.append(len(store.events(watched.id, after=0))))
     store.advance(other.id, JobState.CAPTURING)
@@ -119,16 +118,16 @@ def test_watcher_is_woken_by_its_scan_only_and_until_it_leaves(store: JobStore) 
 
 
 def test_jobs_of_one_parent_are_listed_and_followed_together(tmp_path: Path, clock: SetClock) -> None:
-    jobs = JobStore(Database(tmp_path / "poses.sqlite"), JobKind.POSE, JobKind.SOLVE, clock=clock)
+    jobs = JobStore(Database(tmp_path / "poses.sqlite"), clock=clock)
     session, other = uuid4(), uuid4()
     woken: list[str] = []
     unwatch = jobs.watch(session, lambda: woken.append("session"))
-    first = jobs.create({"number": 1}, rig="bench", label=None, parent=session)
-    alone = jobs.create({"number": 1}, rig="bench", label=None, parent=other)
-    solve = jobs.create({"number": 1}, rig="bench", label=None, kind=JobKind.SOLVE, parent=session)
+    first = jobs.create({"number": 1}, kind=JobKind.POSE, rig="bench", label=None, parent=session)
+    alone = jobs.create({"number": 1}, kind=JobKind.POSE, rig="bench", label=None, parent=other)
+    solve = jobs.create({"number": 1}, kind=JobKind.SOLVE, rig="bench", label=None, parent=session)
     jobs.finish(first.id, JobState.SUCCEEDED, summary={"answer": {}})
-    assert jobs.of(session) == {session: [jobs.get(first.id), jobs.get(solve.id)]}
-    assert [job.id for job in jobs.of()[other]] == [alone.id]
+    assert jobs.of(session) == [jobs.get(first.id), jobs.get(solve.id)]
+    assert [job.id for job in jobs.by_parent()[other]] == [alone.id]
     events = jobs.events_of(session, after=0)
     assert [(event.job, event.data["state"]) for event in events] == [
         (first.id, "queued"), (solve.id, "queued"), (first.id, "succeeded"),
@@ -138,14 +137,14 @@ def test_jobs_of_one_parent_are_listed_and_followed_together(tmp_path: Path, clo
     assert jobs.last_event_of(uuid4()) == 0
     assert len(woken) == 3
     jobs.delete_of(session)
-    assert (jobs.of(session), jobs.events_of(session, after=0)) == ({}, [])
+    assert (jobs.of(session), jobs.events_of(session, after=0)) == ([], [])
     assert jobs.get(alone.id).parent == other
     unwatch()
     jobs.database.close()
 
 
 def test_progress_is_recorded_by_stage_by_hundredths_and_while_a_stage_goes_on(store: JobStore) -> None:
-    scan = store.create({}, rig="bench", label=None)
+    scan = store.create({}, kind=JobKind.SCAN, rig="bench", label=None)
     now_s = [0.0]
     record = ProgressRecorder(store, scan.id, hidden="secret/", now_s=lambda: now_s[0])
     for at_s, stage, fraction, detail in (
@@ -177,7 +176,7 @@ def spans(stages: Iterator[Stage]) -> list[tuple[str, float, float, str | None]]
 def test_job_that_ends_is_told_with_its_stages(store: JobStore, clock: SetClock) -> None:
     told: list[JobRecord] = []
     store.after_end = told.append
-    job = store.create({}, rig="bench", label=None).id
+    job = store.create({}, kind=JobKind.SCAN, rig="bench", label=None).id
     clock.move(seconds=2)
     store.advance(job, JobState.CAPTURING)
     clock.move(seconds=5)
@@ -199,7 +198,7 @@ def test_job_that_ends_is_told_with_its_stages(store: JobStore, clock: SetClock)
 
 
 def test_job_that_never_began_only_waited(store: JobStore, clock: SetClock) -> None:
-    job = store.create({}, rig="bench", label=None).id
+    job = store.create({}, kind=JobKind.SCAN, rig="bench", label=None).id
     clock.move(seconds=4)
     store.finish(job, JobState.CANCELLED)
     assert spans(stages_of(store.get(job), store.events(job, after=0))) == [("queued", 0, 4, None)]
@@ -209,7 +208,7 @@ def test_idempotency_key_leads_back_to_its_scan(store: JobStore, keys: RequestKe
     assert keys.reserve("k", "body") is None
     with pytest.raises(KeyInFlightError):
         keys.reserve("k", "body")
-    scan = store.create({}, rig="bench", label=None, key="k")
+    scan = store.create({}, kind=JobKind.SCAN, rig="bench", label=None, key="k")
     assert keys.reserve("k", "body") == scan.id
     with pytest.raises(IdempotencyError, match="another request body"):
         keys.reserve("k", "other body")
@@ -223,7 +222,7 @@ def test_key_of_a_refused_request_is_free_again(keys: RequestKeys) -> None:
 
 def test_key_of_a_scan_is_not_released(store: JobStore, keys: RequestKeys) -> None:
     keys.reserve("k", "body")
-    scan = store.create({}, rig="bench", label=None, key="k")
+    scan = store.create({}, kind=JobKind.SCAN, rig="bench", label=None, key="k")
     keys.release("k")
     keys.release_all()
     assert keys.reserve("k", "body") == scan.id
@@ -231,7 +230,7 @@ def test_key_of_a_scan_is_not_released(store: JobStore, keys: RequestKeys) -> No
 
 def test_key_is_forgotten_after_a_day(store: JobStore, keys: RequestKeys, clock: SetClock) -> None:
     keys.reserve("k", "body")
-    store.create({}, rig="bench", label=None, key="k")
+    store.create({}, kind=JobKind.SCAN, rig="bench", label=None, key="k")
     clock.move(hours=23, minutes=59)
     with pytest.raises(IdempotencyError):
         keys.reserve("k", "other body")

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from ctypes import c_double
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,14 +38,15 @@ from slrig.jobs.frame_feed import (
     FrameFeed,
     most_waiting_bytes,
 )
+from slrig.jobs.job import Outcome
 from slrig.jobs.worker import LOADING, READY, WAITING, UnexpectedWorkerError, Worker, prepare_kernel_cache
 from slrig.jobs.worker_process import Done, Failed, FileMade, Progressed, Task, Unloadable, serve
 from slrig.jobs.worker_wait import JobWait
 from slrig.model import Shot
-from slrig.scan.job import reconstruction
 from slrig.scan.plan import ReconstructionPlan
+from tests.unit.scan import fake_pipeline
 from tests.unit.scan.bench import PIPELINE
-from tests.unit.scan.fakes import CALIBRATION, EVIDENCE, OUTLINE, SHOTS, WAIT_S
+from tests.unit.scan.fakes import CALIBRATION, EVIDENCE, OUTLINE, SHOTS, WAIT_S, reconstruction
 
 
 @pytest.fixture(scope="module")
@@ -69,8 +71,12 @@ def job(tmp_path: Path, order: str) -> Task:
     bundle = tmp_path / "bundle"
     bundle.mkdir(exist_ok=True, parents=True)
     (bundle / "order").write_text(order)
-    (tmp_path / "result").mkdir(exist_ok=True)
-    return reconstruction(PIPELINE, bundle, tmp_path / "result", ReconstructionPlan(keep_holes=True))
+    return reconstruction(tmp_path, ReconstructionPlan(keep_holes=True))
+
+
+def report_in(tmp_path: Path) -> dict[str, Any]:
+    report: dict[str, Any] = json.loads((tmp_path / "result" / "report.json").read_text())
+    return report
 
 
 def gone(worker: Worker) -> None:
@@ -87,9 +93,9 @@ def killed(worker: Worker) -> None:
 
 def test_report_and_progress_come_back(worker: Worker, tmp_path: Path) -> None:
     told = Told()
-    report = worker.run(job(tmp_path, "finish"), progress=told)
-    assert report["truth"] == {"rms_mm": 0.01}
-    assert json.loads((tmp_path / "result" / "report.json").read_text()) == report
+    found = worker.run(job(tmp_path, "finish"), progress=told)
+    assert found == Outcome({"bundle": tmp_path.name, "seconds": 1.5, "truth": {"rms_mm": 0.01}})
+    assert report_in(tmp_path)["stages"] == [1, 2]
     assert b"keep_holes=True" in (tmp_path / "result" / "points.ply").read_bytes()
     assert told.stages == [("decode", 0.1), ("done", 1.0)]
 
@@ -116,13 +122,13 @@ def test_killed_process_is_named_and_replaced(worker: Worker, tmp_path: Path) ->
     before = worker.process_id
     with pytest.raises(WorkerLostError, match=signal.Signals.SIGKILL.name):
         worker.run(job(tmp_path, "die"), progress=Told())
-    assert worker.run(job(tmp_path, "finish"), progress=Told())["seconds"] == 1.5
+    assert worker.run(job(tmp_path, "finish"), progress=Told()).summary["seconds"] == 1.5
     assert worker.process_id != before
 
 
 def test_process_killed_while_idle_costs_nothing_but_a_new_one(worker: Worker, tmp_path: Path) -> None:
     killed(worker)
-    assert worker.run(job(tmp_path, "finish"), progress=Told())["seconds"] == 1.5
+    assert worker.run(job(tmp_path, "finish"), progress=Told()).summary["seconds"] == 1.5
 
 
 def test_deaf_job_loses_its_process(worker: Worker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,12 +142,13 @@ def test_deaf_job_loses_its_process(worker: Worker, tmp_path: Path, monkeypatch:
 
 
 def task(name: str, *given: object) -> Task:
-    return Task(f"{PIPELINE}:{name}", given, what="examination")
+    return Task(getattr(fake_pipeline, name), given, what="examination")
 
 
-def test_any_named_task_is_done_with_what_it_takes(worker: Worker) -> None:
+def test_any_function_is_called_and_a_job_knows_where_it_is_computed(worker: Worker, tmp_path: Path) -> None:
     assert worker.run(task("process_id")) == worker.process_id
-    assert worker.run(replace(task("told_where"), where={"where": "pool"})) == {"where": "pool"}
+    worker.run(replace(job(tmp_path, "finish"), where={"where": "pool"}))
+    assert report_in(tmp_path)["computed"] == {"where": "pool"}
 
 
 def test_an_answer_that_came_too_late_is_dropped(worker: Worker, tmp_path: Path) -> None:
@@ -154,7 +161,7 @@ def test_an_answer_that_came_too_late_is_dropped(worker: Worker, tmp_path: Path)
     with pytest.raises(KeyboardInterrupt):
         worker.run(job(tmp_path, "finish"), progress=refuse)
     assert worker.run(task("process_id")) == worker.process_id != left
-    assert worker.run(job(tmp_path / "again", "finish"))["seconds"] == 1.5
+    assert worker.run(job(tmp_path / "again", "finish")).summary["seconds"] == 1.5
 
 
 def test_an_answer_of_another_job_is_dropped() -> None:
@@ -235,7 +242,7 @@ def test_how_far_the_kernels_are_is_told_before_and_during_a_job(
     assert fresh.condition == LOADING
     monkeypatch.setenv("PREPARING_GATE", str(gate))
     with pytest.raises(WorkerBusyError, match="not ready yet for the report"):
-        fresh.run(Task(f"{PIPELINE}:process_id", what="report"), within_s=0.0)
+        fresh.run(Task(fake_pipeline.process_id, what="report"), within_s=0.0)
     before = fresh.process_id
     deadline = time.monotonic() + WAIT_S
     while fresh.condition == LOADING and time.monotonic() < deadline:
@@ -250,11 +257,11 @@ def test_how_far_the_kernels_are_is_told_before_and_during_a_job(
         gate.touch()
         return False
 
-    report = fresh.run(
+    fresh.run(
         job(tmp_path, "finish"), progress=lambda stage, _, detail: told.append(f"{stage} {detail}".strip()),
         cancelled=go_on, feed=feed,
     )  # fmt: skip
-    assert report["live"] == [2, 2, True]
+    assert report_in(tmp_path)["live"] == [2, 2, True]
     assert told[:2] == ["preparing kernels first time only: 42 of 118", "decode"]
     assert (fresh.condition, fresh.loading, fresh.process_id) == (READY, False, before)
     fresh.close()
@@ -514,7 +521,8 @@ def run(worker: Worker, tmp_path: Path) -> Ran:
     """Run a job after a capture; return what the reconstruction says of the frames that it was sent."""
 
     def ran(feed: FrameFeed, cancelled: Callable[[], bool] = lambda: False) -> object:
-        return worker.run(job(tmp_path, "finish"), cancelled=cancelled, feed=feed).get("live")
+        worker.run(job(tmp_path, "finish"), cancelled=cancelled, feed=feed)
+        return report_in(tmp_path).get("live")
 
     return ran
 

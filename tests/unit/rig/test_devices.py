@@ -482,17 +482,17 @@ def test_a_scan_goes_first_and_pictures_go_on_after_it(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     # The tame capture asks nothing of these cameras, and lights the tame projector.
     rig = replace(fake_rig().rig, projector=TameProjector())
-    bench.runner.queue.rig = RigSession("bench", lambda: rig)
-    bench.runner.start()
+    bench.manager.rig = RigSession("bench", lambda: rig)
+    bench.manager.start()
     try:
         bench.until(bench.scan().id)
         with pytest.raises(CameraNotFoundError, match="left, right"):
-            bench.runner.queue.watch("middle", Light.OFF)
-        with bench.runner.queue.watch("left", Light.OFF) as watch:
+            bench.manager.watch("middle", Light.OFF)
+        with bench.manager.watch("left", Light.OFF) as watch:
             seen = next_of(watch).number
             held = bench.held()
             with pytest.raises(RigBusyError, match=str(held.id)):
-                bench.runner.queue.watch("left", Light.OFF)
+                bench.manager.watch("left", Light.OFF)
             stood = next_of(watch).number
             assert watch.picture(stood, 0.0) is None
             bench.gate.set()
@@ -506,7 +506,7 @@ def test_before_the_rig_is_open_there_is_nothing_to_see(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     try:
         with pytest.raises(DeviceBusyError, match="being opened"):
-            bench.runner.queue.watch("cam0", Light.OFF)
+            bench.manager.watch("cam0", Light.OFF)
     finally:
         bench.close()
 

@@ -1,21 +1,24 @@
-"""A runner over a tame bench."""
+"""A manager of jobs over a tame bench."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from uuid import UUID
 
+from slrig.api.server import KINDS
 from slrig.errors import InvalidInputError
 from slrig.jobs.compute import Compute
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
-from slrig.jobs.records import JobKind, JobRecord, JobState
+from slrig.jobs.manager import JobManager
+from slrig.jobs.records import JobRecord, JobState
 from slrig.jobs.store import JobStore
 from slrig.rig.session import RigSession
+from slrig.scan.job import ScanJob
 from slrig.scan.plan import ScanPlan
-from slrig.scan.runner import Runner
 from tests.unit.jobs.tame_compute import TameCompute
 from tests.unit.scan.fakes import WAIT_S, TameBench
 
@@ -23,28 +26,30 @@ PIPELINE = "tests.unit.scan.fake_pipeline"
 
 
 class Bench(TameBench):
-    """A runner over a tame bench. worker : what computes, for one that needs no process."""
+    """A manager of jobs over a tame bench. worker : what computes, for one that needs no process."""
 
     def __init__(self, tmp_path: Path, *, worker: Compute | None = None) -> None:
         super().__init__()
         self.free_bytes = 10**9
         self.given_up: list[InvalidInputError] = []
         self.folder = DataFolder(tmp_path / "data", free=lambda _: self.free_bytes)
-        self.store = JobStore(Database(self.folder.database), JobKind.SCAN)
+        self.store = JobStore(Database(self.folder.database))
         self.worker = TameCompute(PIPELINE) if worker is None else worker
-        self.runner = Runner(
+        self.patched = ExitStack()
+        self.patched.enter_context(self.captures())
+        self.manager = JobManager(
             self.store,
             self.folder,
             RigSession("bench", self.open_rig),
             self.worker,
-            capture=self.capture,
+            *KINDS,
             queue_length=1,
             backlog_length=2,
             give_up=self.given_up.append,
         )
 
-    def scan(self, *, wait: bool = False) -> JobRecord:
-        return self.runner.submit(ScanPlan(), label=None, wait=wait)
+    def scan(self, plan: ScanPlan = ScanPlan(), *, wait: bool = False) -> JobRecord:  # noqa: B008 - frozen
+        return self.manager.submit(ScanJob(plan), wait=wait)[0]
 
     def held(self) -> JobRecord:
         """A scan that has begun to capture and goes on until `gate` is set."""
@@ -54,12 +59,11 @@ class Bench(TameBench):
         assert self.began.wait(WAIT_S)
         return scan
 
-    def until(self, job_id: UUID, state: JobState | None = None, *, jobs: JobStore | None = None) -> JobRecord:
-        """The job once it has reached `state`, or any final state. jobs : of its kind, for the scans."""
+    def until(self, job_id: UUID, state: JobState | None = None) -> JobRecord:
+        """The job once it has reached `state`, or any final state."""
         states = {state} if state is not None else {state for state in JobState if state.final}
-        store = self.store if jobs is None else jobs
-        wait_for(store, job_id, lambda: store.get(job_id).state in states)
-        return store.get(job_id)
+        wait_for(self.store, job_id, lambda: self.store.get(job_id).state in states)
+        return self.store.get(job_id)
 
     def until_event(self, scan_id: UUID, kind: str) -> None:
         """Wait until an event of this kind happened to a scan."""
@@ -67,7 +71,8 @@ class Bench(TameBench):
 
     def close(self) -> None:
         self.gate.set()
-        self.runner.close()
+        self.manager.close()
+        self.patched.close()
         self.store.database.close()
         self.folder.release()
 

@@ -79,11 +79,6 @@ def process_id() -> int:
     return os.getpid()
 
 
-def told_where(where: Mapping[str, str]) -> Mapping[str, str]:
-    """How it came to be done where it is."""
-    return where
-
-
 def crash(*_given: object, **_options: object) -> None:
     """Touch what is not there, as a defect in compiled code does."""
     os.kill(os.getpid(), signal.SIGSEGV)
@@ -116,6 +111,7 @@ def reconstruct_into(
     made: Callable[[str], None] = lambda _: None,
     live: LiveScan | None = None,
     judged: EvidenceSummary | None = None,  # noqa: ARG001 - as it is called
+    where: Mapping[str, str] | None = None,
 ) -> Mapping[str, object]:
     """Do what `bundle/order` says: finish, fail, break, die, or wait to be cancelled."""
     order = (bundle / "order").read_text()
@@ -149,6 +145,7 @@ def reconstruct_into(
         "seconds": 1.5,
         "stages": [1, 2],
         "truth": {"rms_mm": 0.01},
+        **({} if where is None or where == {"where": "local"} else {"computed": dict(where)}),
     }
     if live is not None:
         report["live"] = [live.taken, live.listed, live.ended]

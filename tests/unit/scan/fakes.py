@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-import json
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
+from slrig.bundle import write_bundle
 from slrig.capture.verifier import EvidenceSummary
 from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, DisplayedPattern, ProjectorInfo, Rig, Trigger
 from slrig.errors import ScanCancelledError
+from slrig.jobs.compute import job_task
 from slrig.jobs.frame_feed import FrameSink
-from slrig.jobs.rig_jobs import Recorded
-from slrig.model import Black, Calibration, CameraFormat, Frame, Shot, Size, White
+from slrig.jobs.job import JobRun, Recording
+from slrig.jobs.worker_process import Task
+from slrig.model import Axis, Black, Calibration, CameraFormat, Capture, Frame, Gray, Shot, Size, White
 from slrig.model.capture import CaptureHeader
-from slrig.scan.plan import ScanPlan
+from slrig.scan.job import ScanJob
+from slrig.scan.plan import ReconstructionPlan, ScanPlan
+from tests.unit.stand_ins import stand_ins
 
 WAIT_S = 20.0
 """How long a test waits for an event that must come; a pass never waits for it to run out."""
@@ -44,6 +50,12 @@ class SetClock:
     def move(self, **by: float) -> None:
         """Move the clock on by a timedelta's arguments."""
         self.now += timedelta(**by)
+
+
+def reconstruction(folder: Path, plan: ReconstructionPlan = ReconstructionPlan()) -> Task:  # noqa: B008 - frozen
+    """The second part of a scan whose bundle lies in a folder, as the worker is given it."""
+    run = JobRun(uuid4(), folder, None, lambda *_: None, lambda: False)
+    return job_task(ScanJob(ScanPlan(reconstruction=plan)), run)
 
 
 def never(*given: Any, **options: Any) -> Any:
@@ -137,7 +149,7 @@ class TameRecording:
 
 
 class TameBench:
-    """Opens rigs, and captures with them as told.
+    """Opens rigs, and captures with them as told. captured : the rig, the plan and the health of each capture.
 
     `order` is what the fake reconstruction will read; `error` is raised in place of the next capture. While `gate`
     is clear a capture holds the rig, with its light on; `began` is set when one does. A `deaf` capture hears no cancel.
@@ -155,6 +167,12 @@ class TameBench:
         self.gate = threading.Event()
         self.gate.set()
         self.opened: list[tuple[TameCamera, TameProjector]] = []
+        self.captured: list[tuple[Rig, ScanPlan, Mapping[str, Any] | None]] = []
+
+    def captures(self) -> AbstractContextManager[None]:
+        """Have every kind of job capture by `capture` within the block."""
+        modules = ("scan.job", "calibrate.jobs", "calibrate.verification", "accept.running")
+        return stand_ins({f"{module}.capture_frames": self.capture for module in modules})
 
     def open_rig(self) -> Rig:
         if self.open_error is not None:
@@ -174,11 +192,14 @@ class TameBench:
         *,
         progress: Callable[[str, float, str], None],
         cancelled: Callable[[], bool],
-        frames: FrameSink,
-    ) -> Recorded:
+        frames: FrameSink | None = None,
+        health: Mapping[str, Any] | None = None,
+    ) -> Recording:
         rig.projector.show(0)
-        frames.begin(OUTLINE, CALIBRATION)
-        frames.take(SHOTS[0])
+        self.captured.append((rig, plan, health))
+        if frames is not None:
+            frames.begin(OUTLINE, CALIBRATION)
+            frames.take(SHOTS[0])
         progress("capture", 0.0, "frame 1 of 2")
         self.began.set()
         while not self.gate.wait(0.01):
@@ -188,12 +209,13 @@ class TameBench:
         if self.error is not None:
             error, self.error = self.error, None
             raise error
-        folder.mkdir()
+        patterns = (White(), Black(), *([Gray(Axis.COLUMN, 0, 6)] if plan.patterns.codes else []))
+        image = np.zeros((48, 64), dtype=np.uint8)
+        shots = tuple(Shot(index, "cam0", image) for index in range(len(patterns)))
+        write_bundle(folder, Capture(OUTLINE.projector, patterns, OUTLINE.cameras, shots), rig.calibration)
         (folder / "order").write_text(self.order)
-        (folder / "bundle.json").write_text(json.dumps({"exposure_s": plan.exposure_s}))
-        (folder / "frames").mkdir()
-        (folder / "frames" / "000.png").write_bytes(bytes(100))
-        frames.take(SHOTS[1])
-        frames.end(EVIDENCE)
+        if frames is not None:
+            frames.take(SHOTS[1])
+            frames.end(EVIDENCE)
         progress("capture", 1.0, "frame 2 of 2")
         return self.recording

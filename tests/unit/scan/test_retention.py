@@ -28,13 +28,13 @@ class Archive:
     def __init__(self, root: Path) -> None:
         self.now, self.now_s = NOON, 0.0
         self.folder = DataFolder(root)
-        self.store = JobStore(Database(self.folder.database), JobKind.SCAN, clock=lambda: self.now)
+        self.store = JobStore(Database(self.folder.database), clock=lambda: self.now)
         self.deleted: list[UUID] = []
         self.refuses: set[UUID] = set()
 
     def scan(self, state: JobState = JobState.SUCCEEDED) -> UUID:
         self.now += timedelta(hours=1)
-        made = self.store.create(plan_json(ScanPlan()), rig="bench", label=None).id
+        made = self.store.create(plan_json(ScanPlan()), kind=JobKind.SCAN, rig="bench", label=None).id
         if state.final:
             self.store.finish(made, state)
             self.folder.scan(made).mkdir()

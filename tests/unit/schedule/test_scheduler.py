@@ -33,7 +33,7 @@ from slrig.schedule.records import Cron, RunState, Schedule, ScheduledRun, Sched
 from slrig.schedule.scheduler import LOOK_S, Scheduler
 from slrig.schedule.store import ScheduleStore
 from tests.samples import put_database
-from tests.unit.jobs.tame_queue import PowerCut
+from tests.unit.jobs.tame_manager import PowerCut
 from tests.unit.scan.fakes import WAIT_S
 
 START = datetime(2026, 11, 23, 5, 0, tzinfo=UTC)
@@ -62,8 +62,7 @@ class Desk:
             execute=lambda call: call(),
         )
 
-    def _work(self, schedule: Schedule, run: ScheduledRun, cancelled: Callable[[], bool], /) -> Mapping[str, Any]:
-        assert not cancelled()
+    def _work(self, schedule: Schedule, run: ScheduledRun, /) -> Mapping[str, Any]:
         if self.busy is not None:
             raise RigBusyError(self.busy, holder=self.busy, since=START.isoformat())
         self.done.append((schedule, run))

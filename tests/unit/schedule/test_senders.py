@@ -26,10 +26,10 @@ from slrig.schedule.records import Cron, RunState, Schedule, ScheduledRun, Sched
 from slrig.schedule.sending import Sender
 from slrig.schedule.webhook import Webhook, signature, signing_key
 from tests.samples import put_database
-from tests.unit.jobs.tame_queue import PowerCut
+from tests.unit.calibrate.health_bench import a_verification, hours
+from tests.unit.jobs.tame_manager import PowerCut
 from tests.unit.scan.fakes import WAIT_S, SetClock
 from tests.unit.schedule.receivers import PATH, SECRET, Hook, own_certificate, signed
-from tests.unit.verify.health_bench import a_verification, hours
 
 DUE = datetime(2026, 11, 23, 5, 30, tzinfo=UTC)
 SCHEDULE = Schedule(UUID(int=7), ScheduleSpec(Cron("30 6 * * *", "Europe/Berlin"), TaskKind.VERIFICATION), DUE, DUE)
@@ -114,9 +114,9 @@ def test_end_of_a_job_of_any_kind_gives_one_notice(database: Database, outbox: O
         }),
     ]  # fmt: skip
     for kind, plan, of, state, links in made:
-        jobs = JobStore(database, kind, outbox=outbox, clock=lambda: DUE)
+        jobs = JobStore(database, outbox=outbox, clock=lambda: DUE)
         with acting_as("Ann"):
-            job = jobs.create(plan, rig="bench", label="by hand", parent=of)
+            job = jobs.create(plan, kind=kind, rig="bench", label="by hand", parent=of)
         jobs.advance(job.id, JobState.CAPTURING)
         assert told(outbox) == [], "it has not ended"
         jobs.finish(job.id, state, fault=fault if state is at.FAILED else None)
@@ -137,8 +137,8 @@ def test_end_of_a_job_of_any_kind_gives_one_notice(database: Database, outbox: O
 def test_end_and_notice_are_recorded_together_or_not_at_all(
     database: Database, outbox: Outbox, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    jobs = JobStore(database, JobKind.SCAN, outbox=outbox)
-    job = jobs.create({}, rig="bench", label=None)
+    jobs = JobStore(database, outbox=outbox)
+    job = jobs.create({}, kind=JobKind.SCAN, rig="bench", label=None)
 
     def put(*_: object, **__: object) -> None:
         raise PowerCut
@@ -168,8 +168,8 @@ def test_end_and_notice_are_recorded_together_or_not_at_all(
 
 def test_kinds_that_are_not_wanted_are_not_kept(database: Database) -> None:
     outbox = Outbox(database, rig="bench", wanted={"webhook": ["run.failed"]})
-    jobs = JobStore(database, JobKind.SCAN, outbox=outbox)
-    jobs.finish(jobs.create({}, rig="bench", label=None).id, JobState.SUCCEEDED)
+    jobs = JobStore(database, outbox=outbox)
+    jobs.finish(jobs.create({}, kind=JobKind.SCAN, rig="bench", label=None).id, JobState.SUCCEEDED)
     with database.changing() as session:
         tell_run(outbox, session, SCHEDULE, run(RunState.MISSED))
         tell_run(outbox, session, SCHEDULE, run(RunState.FAILED))

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, cast
-from uuid import UUID, uuid4
+from uuid import UUID
 
 import pytest
 
 from slrig.accept.asking import AcceptanceRequest
-from slrig.accept.desk import AcceptanceDesk
-from slrig.accept.report import write_reports
-from slrig.accept.running import evaluated
+from slrig.accept.job import AcceptanceTests
+from slrig.calibrate.verification import HealthStore, RigHealth
 from slrig.errors import (
     CalibrationError,
     DeviceError,
@@ -28,66 +26,45 @@ from slrig.errors import (
     SolveRefusedError,
 )
 from slrig.failure import JobFailure
-from slrig.jobs.database import Database
-from slrig.jobs.job import Holder, Job
-from slrig.jobs.records import JobKind, JobState, utc_now
-from slrig.jobs.store import JobStore
-from slrig.schedule import rig_tasks
+from slrig.jobs.records import Holder, JobKind, JobState
 from slrig.schedule.records import Cron, RunState, Schedule, ScheduledRun, ScheduleSpec, TaskKind
 from slrig.schedule.rig_tasks import error_of
 from slrig.schedule.tasks import Tasks
-from slrig.verify.job import VerificationDesk
-from slrig.verify.store import HealthStore
-from slrig.verify.verification import VerificationTools
-from tests.unit.accept.test_desk import PLAN, desk, desks, queue
+from tests.unit.accept.test_job import PLAN, Desk, desk, desks
 from tests.unit.calibrate.calibration_bench import CalibrationBench
-from tests.unit.jobs.tame_queue import TameQueue
+from tests.unit.calibrate.health_bench import a_verification
 from tests.unit.scan.fakes import WAIT_S
-from tests.unit.verify.health_bench import a_verification
+from tests.unit.stand_ins import stand_ins
 
-__all__ = ["desk", "desks", "queue"]
+__all__ = ["desk", "desks"]
 
 BOARD = {"kind": "chessboard", "corners": [4, 3], "square_mm": 10.0}
 
 
 class TaskBench(CalibrationBench):
-    """A runner over a tame bench, the desks over it, and the tasks of schedules over them."""
+    """Calibrations over a tame bench, verifications, and the tasks of schedules over them."""
 
     def __init__(self, tmp_path: Path, *, positioner: bool = True) -> None:
         super().__init__(tmp_path, positioner=positioner)
-        self.queue = self.runner.queue
-        self.health = HealthStore(Database(self.folder.database))
-        tools = self.tame.tools()
-        verifying = VerificationTools(tools.capture, tools.read, lambda *_: a_verification())
-        self.verifications = VerificationDesk(
-            self.folder, self.queue, self.health, JobStore(self.health.database, JobKind.VERIFICATION), tools=verifying
-        )
-        self.acceptance = AcceptanceDesk(
-            self.folder, self.queue, JobStore(self.health.database, JobKind.POSITION), evaluate=evaluated,
-            report=write_reports,
-        )  # fmt: skip
+        verify = {"calibration.health.verification.verify_by_board": lambda *_: a_verification()}
+        self.patched.enter_context(stand_ins(verify))
+        self.health = HealthStore(self.store.database)
+        self.manager.groups[JobKind.VERIFICATION] = RigHealth(self.manager.rig, self.health, self.folder)
         self.tidied: list[int] = []
         self.tasks = Tasks(
-            self.queue, self.calibrations, self.verifications, self.acceptance,
+            self.manager, self.calibrations, AcceptanceTests(self.manager),
             tidy=lambda: self.tidied.append(len(self.calibrations.latest())),
         )  # fmt: skip
 
-    def do(self, task: TaskKind, *, cancelled: Callable[[], bool] = lambda: False, **options: Any) -> Mapping[str, Any]:
-        return self.tasks(*scheduled(task, options), cancelled)
+    def do(self, task: TaskKind, **options: Any) -> Mapping[str, Any]:
+        return self.tasks(*scheduled(task, options))
 
     def use_a_calibration(self) -> None:
         """Have scans use a calibration whose board is known."""
         self.calibrations.activate(self.solved(poses=1))
 
     def open(self) -> None:
-        opened = threading.Event()
-        job = Job(uuid4(), Holder("a", "b", "/c"), utc_now(), lambda rig, _: rig.open(), lambda _: opened.set())
-        self.queue.submit(lambda: [job], wait=True)
-        assert opened.wait(WAIT_S)
-
-    def close(self) -> None:
-        super().close()
-        self.health.database.close()
+        self.manager.lend(Holder("a", "b", "/c"), lambda rig, _: rig.open())
 
 
 def scheduled(task: TaskKind, options: Mapping[str, Any]) -> tuple[Schedule, ScheduledRun]:
@@ -100,15 +77,10 @@ ID = UUID("3f2a0000-9f0e-4c57-8a39-5f8a4f0c2b11")
 HOLDER = "schedule 3f2a0000, {} due 06:30"
 
 
-@pytest.fixture(autouse=True)
-def looks_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rig_tasks, "LOOK_S", 0.005)
-
-
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[TaskBench]:
     made = TaskBench(tmp_path)
-    made.runner.start()
+    made.manager.start()
     yield made
     made.close()
 
@@ -117,7 +89,7 @@ def bench(tmp_path: Path) -> Iterator[TaskBench]:
 def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TaskBench]:
     """A bench whose rig is open, for tests that change nothing."""
     made = TaskBench(tmp_path_factory.mktemp("opened"))
-    made.runner.start()
+    made.manager.start()
     made.open()
     yield made
     made.close()
@@ -176,7 +148,7 @@ def test_work_that_needs_a_positioner_is_refused_where_there_is_none(tmp_path: P
     for task, options in orders:
         # It is not known before the rig is open: a run is refused then.
         checked(bench.tasks, task, options)
-    bench.runner.start()
+    bench.manager.start()
     bench.open()
     for task, options in orders:
         with pytest.raises(ScheduleError, match="no positioner, and nobody is there to move anything"):
@@ -203,7 +175,7 @@ def test_calibration_takes_every_pose_solves_and_is_used_only_if_ordered(bench: 
 
 def test_calibration_that_is_not_to_be_used_is_not_activated(bench: TaskBench, monkeypatch: pytest.MonkeyPatch) -> None:
     bad = {"verdict": {"grade": "do_not_use", "summary": "do not use: 9 px", "unattended": ["it is bad"]}}
-    monkeypatch.setattr(bench.calibrations.solves, "tools", replace(bench.tame.tools(), summary=lambda _: bad))
+    monkeypatch.setattr("slrig.calibrate.pose_judging.summary", lambda _: bad)
     told = bench.do(TaskKind.CALIBRATION, board=BOARD, activate=True)
     assert (told["activated"], told["verdict"]) == (False, "do not use: 9 px")
     assert told["left_to_a_person"] == ["it is bad"]
@@ -231,7 +203,7 @@ def test_device_or_solve_that_fails_fails_the_run(bench: TaskBench) -> None:
 def test_rig_that_cannot_be_opened_fails_the_run_with_its_cause(tmp_path: Path) -> None:
     bench = TaskBench(tmp_path)
     bench.open_error = DeviceError("no camera is plugged in")
-    bench.runner.start()
+    bench.manager.start()
     with pytest.raises(DeviceError, match="no camera is plugged in"):
         bench.do(TaskKind.CALIBRATION, board=BOARD)
     bench.open_error = None
@@ -294,20 +266,18 @@ def test_run_holds_the_rig_in_the_name_of_its_schedule_until_it_is_cancelled(ben
     assert bench.until(bench.scan(wait=True).id).state is JobState.SUCCEEDED
 
 
-def test_acceptance_is_measured_by_script_and_gives_its_decision(
-    desk: AcceptanceDesk, queue: TameQueue, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_acceptance_is_measured_by_script_and_gives_its_decision(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(AcceptanceRequest, "plan", lambda *_: PLAN)
     schedule, run = scheduled(TaskKind.ACCEPTANCE, {})
-    tasks = Tasks(queue, cast("Any", None), cast("Any", None), desk)
-    told = tasks(schedule, run, lambda: False)
-    assert queue.holders == [HOLDER.format("acceptance")]
+    tasks = Tasks(desk.manager, cast("Any", None), desk)
+    told = tasks(schedule, run)
+    assert desk.manager.holders == [HOLDER.format("acceptance")] * len(PLAN.steps)
     assert told["decision"] == "passes"
     assert told["quantities"]["PF"]["position"].startswith("sphere-")
     assert desk.file(UUID(told["acceptance"]), "report.html").is_file()
-    queue.busy = "1"
+    desk.manager.busy = "1"
     with pytest.raises(RigBusyError):
-        tasks(schedule, run, lambda: False)
+        tasks(schedule, run)
 
 
 def test_fault_of_a_busy_rig_is_that_of_a_device() -> None:

@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 from uuid import UUID
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
+from slrig.bundle import write_calibration
 from slrig.calibrate.solving import ReadPose
+from slrig.calibrate.trend import health_svg
+from slrig.calibrate.verification import (
+    HealthStore,
+    RigHealth,
+    VerificationJob,
+    VerificationRecord,
+    health_stamp,
+    require_healthy,
+    verify_bundle,
+)
 from slrig.calibration.board import Board, BoardKind, PoseObservation, ViewQuality
 from slrig.calibration.health import Health, HealthState, Verification, judge_health
 from slrig.devices import Rig
@@ -21,37 +32,30 @@ from slrig.errors import CalibrationStateError, PoseRefusedError
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.records import JobKind, JobRecord, JobState
+from slrig.jobs.resume import resume
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration
-from slrig.verify.job import VerificationDesk
-from slrig.verify.plot import health_svg
-from slrig.verify.store import HealthStore, VerificationRecord
-from slrig.verify.verification import VerificationTools, health_stamp, require_healthy, verify_bundle
+from tests.unit.calibrate.health_bench import a_verification, hours
 from tests.unit.calibration.health.drifting import bench
-from tests.unit.jobs.tame_queue import TameQueue
-from tests.unit.scan.bench import wait_for
-from tests.unit.scan.fakes import TameProjector, TameRecording
-from tests.unit.verify.health_bench import a_verification, hours
+from tests.unit.jobs.tame_compute import TameCompute
+from tests.unit.jobs.tame_manager import TameManager
+from tests.unit.scan.bench import PIPELINE
+from tests.unit.scan.fakes import WAIT_S, TameProjector, TameRecording
 
 BOARD = Board(BoardKind.CHESSBOARD, 11, 8, 12.0)
 CALIBRATION = bench().calibration
 
 
-def queue_of(calibration: Calibration | None = CALIBRATION) -> TameQueue:
-    """One with a rig that is no rig; without a calibration it is not open yet."""
-    rig = Rig("bench", {}, TameProjector(), {}, calibration)
-    return TameQueue(rig, opened=calibration is not None)
-
-
-def capture(_rig: Rig, _plan: object, folder: Path, /, **_options: object) -> TameRecording:
-    """Writes a bundle that is none."""
+def capture(rig: Rig, _plan: object, folder: Path, /, **_options: object) -> TameRecording:
+    """Writes a bundle that has only its calibration."""
     folder.mkdir()
-    (folder / "frames").write_text("frames")
+    if rig.calibration is not None:
+        write_calibration(folder / "calibration.json", rig.calibration)
     return TameRecording()
 
 
 def read(folder: Path, _board: Board, name: str) -> ReadPose:
-    assert (folder / "frames").exists()
+    assert (folder / "calibration.json").exists()
     return ReadPose(PoseObservation(name, {}), {"left": ViewQuality(0.02, 0.0, 0.5, 0.7, 1.0)})
 
 
@@ -59,11 +63,12 @@ def moving(_folder: Path, _board: Board, name: str) -> ReadPose:
     return ReadPose(PoseObservation(name, {}), {"left": ViewQuality(0.9, 0.0, 0.5, 0.7, 1.0)})
 
 
-def look(_poses: Sequence[Any], _board: Board, _calibration: Calibration) -> Verification:
-    return a_verification()
-
-
-TAME = VerificationTools(capture=cast("Any", capture), read=read, judge=look)
+@pytest.fixture(autouse=True)
+def tame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shoots and reads nothing, and finds what `a_verification` says."""
+    monkeypatch.setattr("slrig.calibrate.verification.capture_frames", capture)
+    monkeypatch.setattr("slrig.calibrate.pose_reading.read_pose", read)
+    monkeypatch.setattr("slrig.calibration.health.verification.verify_by_board", lambda *_: a_verification())
 
 
 @pytest.fixture
@@ -80,44 +85,45 @@ def store(folder: DataFolder) -> Iterator[HealthStore]:
     found.database.close()
 
 
-def desk_of(folder: DataFolder, store: HealthStore, queue: TameQueue, **options: Any) -> VerificationDesk:
-    options.setdefault("tools", TAME)
-    return VerificationDesk(folder, queue, store, JobStore(store.database, JobKind.VERIFICATION), **options)
+class Verifying:
+    """Verifications on a rig that is no rig; without a calibration it is not open yet."""
 
+    def __init__(
+        self, folder: DataFolder, store: HealthStore, calibration: Calibration | None = CALIBRATION, **options: Any
+    ) -> None:
+        rig = Rig("bench", {}, TameProjector(), {}, calibration)
+        jobs, worker = JobStore(store.database), TameCompute(PIPELINE)
+        self.manager = TameManager(jobs, folder, rig, worker, opened=calibration is not None)
+        self.health = RigHealth(self.manager.rig, store, folder, **options)
+        self.manager.groups[JobKind.VERIFICATION] = self.health
 
-def over(desk: VerificationDesk, job_id: UUID) -> JobRecord:
-    """A verification when it is over."""
-    wait_for(desk.jobs, job_id, lambda: desk.jobs.get(job_id).state.final)
-    return desk.jobs.get(job_id)
-
-
-def done(desk: VerificationDesk, **options: Any) -> JobRecord:
-    """A verification from beginning to end."""
-    return over(desk, desk.shoot(BOARD, **options).id)
+    def done(self) -> JobRecord:
+        """A verification from beginning to end."""
+        return self.manager.wait(self.manager.submit(VerificationJob(BOARD), wait=True)[0].id, WAIT_S)
 
 
 def test_a_verification_is_shot_judged_and_put_on_record(folder: DataFolder, store: HealthStore) -> None:
-    desk = desk_of(folder, store, queue_of(), clock=lambda: hours(1))
-    assert desk.health()[0].state is HealthState.UNKNOWN
-    job = done(desk)
+    verifying = Verifying(folder, store, clock=lambda: hours(1))
+    assert verifying.health.health()[0].state is HealthState.UNKNOWN
+    job = verifying.done()
     assert job.state is JobState.SUCCEEDED
     latest = store.latest()
     assert latest is not None
     assert job.summary == json.loads(json.dumps(latest.document()))
     assert (latest.at, latest.calibration) == (hours(1), "0123456789ab")
-    told = [(event.kind, event.data["state"]) for event in desk.jobs.events(job.id, after=0)]
+    told = [(event.kind, event.data["state"]) for event in verifying.manager.store.events(job.id, after=0)]
     assert told == [
         ("state", "queued"), ("state", "capturing"), ("captured", "capturing"), ("state", "computing"),
         ("state", "succeeded"),
     ]  # fmt: skip
-    health, found, calibration = desk.health()
+    health, found, calibration = verifying.health.health()
     assert health.state is HealthState.GOOD
     assert found == latest
     assert calibration is CALIBRATION
     assert list(folder.incoming.iterdir()) == []
     # Both outlive the service.
     again = HealthStore(Database(folder.database))
-    assert desk_of(folder, again, queue_of()).jobs.get(job.id) == job
+    assert Verifying(folder, again).manager.store.get(job.id) == job
     kept = again.latest()
     assert kept is not None
     assert kept.document() == latest.document()
@@ -126,18 +132,20 @@ def test_a_verification_is_shot_judged_and_put_on_record(folder: DataFolder, sto
 
 
 def test_rig_without_a_calibration_fails_with_a_remedy(folder: DataFolder, store: HealthStore) -> None:
-    desk = desk_of(folder, store, queue_of(None))
-    job = done(desk)
+    verifying = Verifying(folder, store, None)
+    job = verifying.done()
     assert job.state is JobState.FAILED
     assert job.fault is not None
     assert job.fault.code == "calibration-state"
     assert "Calibrate it" in job.fault.message
-    assert desk.health()[0].state is HealthState.UNKNOWN
+    assert verifying.health.health()[0].state is HealthState.UNKNOWN
 
 
-def test_a_board_that_moved_is_refused_and_leaves_nothing(folder: DataFolder, store: HealthStore) -> None:
-    tools = VerificationTools(capture=cast("Any", capture), read=moving, judge=look)
-    job = done(desk_of(folder, store, queue_of(), tools=tools))
+def test_a_board_that_moved_is_refused_and_leaves_nothing(
+    folder: DataFolder, store: HealthStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("slrig.calibrate.pose_reading.read_pose", moving)
+    job = Verifying(folder, store).done()
     assert job.state is JobState.FAILED
     assert job.fault is not None
     assert "camera 'left': the board moved by 0.90 px while it was shot" in job.fault.message
@@ -148,26 +156,25 @@ def test_a_board_that_moved_is_refused_and_leaves_nothing(folder: DataFolder, st
 def test_after_a_kill_one_that_waited_is_shot_and_one_under_way_is_interrupted(
     folder: DataFolder, store: HealthStore
 ) -> None:
-    queue = queue_of()
-    queue.lazy = True
-    before = desk_of(folder, store, queue)
-    waiting, shot = before.shoot(BOARD, wait=True), before.shoot(BOARD, wait=True)
-    before.jobs.advance(shot.id, JobState.CAPTURING)
-    after = desk_of(folder, store, queue_of())
-    after.take_up()
-    assert over(after, waiting.id).state is JobState.SUCCEEDED
-    cut_off = after.jobs.get(shot.id)
+    before = Verifying(folder, store).manager
+    before.lazy = True
+    waiting, shot = (before.submit(VerificationJob(BOARD), wait=True)[0].id for _ in range(2))
+    before.store.advance(shot, JobState.CAPTURING)
+    after = Verifying(folder, store).manager
+    resume(after)
+    assert after.wait(waiting, WAIT_S).state is JobState.SUCCEEDED
+    cut_off = after.store.get(shot)
     assert cut_off.state is JobState.INTERRUPTED
     assert cut_off.fault is not None
     assert cut_off.fault.code == "scan-interrupted"
 
 
-def test_a_recorded_pose_is_judged(tmp_path: Path) -> None:
-    capture(cast("Rig", None), None, tmp_path / "pose")
-    assert verify_bundle(tmp_path / "pose", BOARD, CALIBRATION, tools=TAME).document() == a_verification().document()
-    tools = VerificationTools(read=moving, judge=look)
+def test_a_recorded_pose_is_judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture(Rig("bench", {}, TameProjector(), {}, CALIBRATION), None, tmp_path / "pose")
+    assert verify_bundle(tmp_path / "pose", BOARD, CALIBRATION).document() == a_verification().document()
+    monkeypatch.setattr("slrig.calibrate.pose_reading.read_pose", moving)
     with pytest.raises(PoseRefusedError, match="put it on a stand"):
-        verify_bundle(tmp_path / "pose", BOARD, CALIBRATION, tools=tools)
+        verify_bundle(tmp_path / "pose", BOARD, CALIBRATION)
 
 
 def test_a_stale_rig_refuses_scans_if_its_file_says_so() -> None:

@@ -38,13 +38,14 @@ from slrig.errors import (
     StorageError,
     UnsupportedByDeviceError,
 )
-from slrig.jobs import database, endings
-from slrig.jobs.records import JobRecord, JobState, utc_now
+from slrig.jobs import database, manager
+from slrig.jobs.records import JobRecord, JobState, read_record, utc_now
+from slrig.jobs.resume import resume
 from slrig.model import Calibration
 from slrig.rig.session import ActiveCalibration, RigSession
+from slrig.scan.job import ScanJob, cancel_series, scans_of, series
 from slrig.scan.plan import PatternPlan, ScanPlan, SeriesPlace, series_of
-from slrig.scan.records import plan_from_json, plan_json, read_record
-from slrig.scan.sweep import sweep
+from slrig.scan.records import plan_from_json
 from tests.unit.calibrate.calibration_bench import tame_calibration
 from tests.unit.scan.bench import Bench, failure_code
 from tests.unit.scan.fakes import WAIT_S, TameBench
@@ -81,7 +82,7 @@ def test_scan_walks_to_its_mesh(bench: Bench) -> None:
 def test_what_is_no_fault_of_a_device_leaves_the_rig_open(bench: Bench, error: SlrigError) -> None:
     bench.error = error
     assert failure_code(bench.until(bench.scan().id)) == error.code
-    assert bench.runner.status().fault is None
+    assert bench.manager.status().fault is None
     assert bench.until(bench.scan().id).state is JobState.SUCCEEDED
     assert len(bench.opened) == 1
 
@@ -105,13 +106,13 @@ def test_projector_that_stays_lit_is_told(bench: Bench) -> None:
     projector.blank_error = DeviceError("The projector does not answer.")
     bench.open_error = DeviceGoneError("No projector on ttyUSB0.")
     with capture_logs() as logs:
-        bench.runner.cancel(scan.id)
+        bench.manager.cancel(scan.id)
         assert bench.until(scan.id).state is JobState.CANCELLED
     told = [each for each in logs if "does not go dark" in each["event"]]
     assert [(each["log_level"], each["rig"]) for each in told] == [("error", "bench")]
     assert (camera.closed, projector.closed) == (True, True)
     silent = "The projector does not answer. (projector 'projector', in blank)"
-    assert bench.runner.status().fault in {silent, "No projector on ttyUSB0."}
+    assert bench.manager.status().fault in {silent, "No projector on ttyUSB0."}
 
 
 @pytest.mark.parametrize(
@@ -128,7 +129,7 @@ def test_rig_that_cannot_be_opened_fails_the_scan_and_a_wrong_rig_file_is_given_
 ) -> None:
     bench = Bench(tmp_path)
     bench.open_error = error
-    bench.runner.start()
+    bench.manager.start()
     assert failure_code(bench.until(bench.scan().id)) == error.code
     # Once: at the first opening, not at the scan's own.
     assert bench.given_up == ([error] if isinstance(error, InvalidInputError) else [])
@@ -172,16 +173,16 @@ def test_rig_that_was_let_go_is_opened_once_more_and_says_how_that_went() -> Non
 def test_plan_is_held_against_the_open_rig_and_the_free_disk(bench: Bench) -> None:
     bench.until(bench.scan().id)
     with pytest.raises(PatternError):
-        bench.runner.submit(ScanPlan(patterns=PatternPlan(gray_cell_px=7)), label=None, wait=False)
+        bench.scan(ScanPlan(patterns=PatternPlan(gray_cell_px=7)))
     with pytest.raises(UnsupportedByDeviceError, match=r"exposure_s: 5 s .*'cam0' can do 0\.001 s to 1 s"):
-        bench.runner.submit(ScanPlan(exposure_s=5.0), label=None, wait=False)
+        bench.scan(ScanPlan(exposure_s=5.0))
     known = tame_calibration()
     above = replace(known.cameras["cam0"], rotation=np.eye(3), translation_mm=np.array([0.0, 90.0, 0.0]))
     assert known.projector is not None
     level = replace(known.projector, rotation=np.eye(3), translation_mm=np.zeros(3))
-    bench.runner.use_calibration(ActiveCalibration("spring", Calibration({"cam0": above}, level)))
+    bench.manager.rig.use_calibration(ActiveCalibration("spring", Calibration({"cam0": above}, level)))
     with pytest.raises(PatternError, match="above or below the projector"):
-        bench.runner.submit(ScanPlan(patterns=PatternPlan(rows=False)), label=None, wait=False)
+        bench.scan(ScanPlan(patterns=PatternPlan(rows=False)))
     bench.free_bytes = 1000
     with pytest.raises(StorageError, match="are free"):
         bench.scan()
@@ -193,10 +194,10 @@ def test_plan_is_held_against_the_open_rig_and_the_free_disk(bench: Bench) -> No
 def test_delete_removes_record_and_files_once_a_scan_is_over(bench: Bench) -> None:
     scan = bench.held()
     with pytest.raises(ScanStateError, match="capturing"):
-        bench.runner.delete(scan.id)
+        bench.manager.delete(scan.id)
     bench.gate.set()
     bench.until(scan.id)
-    bench.runner.delete(scan.id)
+    bench.manager.delete(scan.id)
     assert not bench.folder.scan(scan.id).exists()
     assert list(bench.folder.incoming.iterdir()) == []
     assert bench.store.page(before=None, limit=10) == []
@@ -220,14 +221,14 @@ def go_on(bench: Bench, scan_id: UUID) -> None:
 
 def test_the_next_scan_is_shot_while_one_is_reconstructed_and_a_third_waits(bench: Bench) -> None:
     first = computing(bench)
-    status = bench.runner.status()
+    status = bench.manager.status()
     assert (status.holder, status.computing, status.backlog_length) == (None, (str(first.id),), 2)
     # Not in line: the rig is free.
     second = bench.until(bench.scan().id, JobState.COMPUTING)
-    assert bench.runner.status().computing == (str(first.id), str(second.id))
+    assert bench.manager.status().computing == (str(first.id), str(second.id))
     bench.began.clear()
     third = bench.scan()
-    status = bench.runner.status()
+    status = bench.manager.status()
     assert (status.holder, status.waiting, len(status.computing)) == (None, 1, 2)
     with pytest.raises(RigBusyError):
         bench.scan()
@@ -240,7 +241,7 @@ def test_the_next_scan_is_shot_while_one_is_reconstructed_and_a_third_waits(benc
         assert_own(bench, record)
         # Each has its frames from its capture.
         assert b'"live": [2, 2, true]' in (bench.folder.scan(scan_id) / "report.json").read_bytes()
-    assert bench.runner.status().computing == ()
+    assert bench.manager.status().computing == ()
 
 
 def test_a_capture_that_fails_costs_the_scans_before_it_nothing(bench: Bench) -> None:
@@ -267,18 +268,16 @@ def test_the_mesh_is_announced_before_the_scan_is_over(bench: Bench) -> None:
 
 def test_scans_that_a_kill_left_are_taken_up_again(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
-    cut_off = bench.store.create(plan_json(ScanPlan()), rig="bench", label="cut off").id
+    cut_off = bench.manager.record(ScanJob(ScanPlan()), label="cut off")[0].id
     bench.store.advance(cut_off, JobState.COMPUTING)
     bundle = bench.folder.stage(cut_off) / "bundle"
     bundle.mkdir()
     (bundle / "order").write_text("finish")
     (bundle.parent / "result.part").mkdir()
     # More than may wait: they were accepted before.
-    queued = [bench.store.create(plan_json(ScanPlan()), rig="bench", label=None).id for _ in range(3)]
-    resumed = sweep(bench.store, bench.folder).resumed
-    assert resumed == (cut_off, *queued)
-    bench.runner.take_up(resumed)
-    bench.runner.start()
+    queued = [bench.manager.record(ScanJob(ScanPlan()))[0].id for _ in range(3)]
+    resume(bench.manager)
+    bench.manager.start()
     for scan_id in (cut_off, *queued):
         record = bench.until(scan_id)
         assert record.state is JobState.SUCCEEDED, record.fault
@@ -300,11 +299,11 @@ HOUR_S = 3600.0
 
 def begun(bench: Bench, *, repeat: int, every_s: float = 0.0) -> list[JobRecord]:
     """The scans of a series that was sent."""
-    first = bench.runner.submit(ScanPlan(), label="series", wait=False, repeat=repeat, every_s=every_s)
+    first = bench.manager.submit(*scans_of(ScanPlan(), repeat=repeat, every_s=every_s), label="series")[0]
     assert first.parent is not None
-    scans = bench.runner.series(first.parent)
+    scans = series(bench.store, first.parent)
     assert scans[0].id == first.id
-    return scans
+    return list(scans)
 
 
 def place(record: JobRecord) -> SeriesPlace:
@@ -331,25 +330,24 @@ def test_others_pass_a_scan_that_waits_for_its_time_and_a_series_is_cancelled_as
     assert place(others[0]).due_at - place(first).due_at == timedelta(seconds=HOUR_S)
     bench.until(first.id)
     # The rig is free, and nothing waits for it now.
-    status = bench.runner.status()
+    status = bench.manager.status()
     assert (status.holder, status.waiting) == (None, 0)
     assert bench.until(bench.scan().id).state is JobState.SUCCEEDED
     assert bench.store.get(others[0].id).state is JobState.QUEUED
     assert first.parent is not None
     for _ in range(2):
-        cancelled = [each.state for each in bench.runner.cancel_series(first.parent)]
+        cancelled = [each.state for each in cancel_series(bench.manager, first.parent)]
         assert cancelled == [JobState.SUCCEEDED, JobState.CANCELLED, JobState.CANCELLED]
     with pytest.raises(JobNotFoundError, match="No series"):
-        bench.runner.cancel_series(uuid4())
+        cancel_series(bench.manager, uuid4())
 
 
 def test_a_series_goes_on_after_a_restart(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
-    series = UUID(int=7)
-    plans = series_of(ScanPlan(), series, count=2, every_s=HOUR_S, begins_at=utc_now() - timedelta(seconds=60))
-    due, later = bench.store.create_series([plan_json(each) for each in plans], rig="bench", label=None, parent=series)
-    bench.runner.take_up([due.id, later.id])
-    bench.runner.start()
+    plans = series_of(ScanPlan(), UUID(int=7), count=2, every_s=HOUR_S, begins_at=utc_now() - timedelta(seconds=60))
+    due, later = bench.manager.record(*map(ScanJob, plans))
+    resume(bench.manager)
+    bench.manager.start()
     assert bench.until(due.id).state is JobState.SUCCEEDED
     assert bench.store.get(later.id).state is JobState.QUEUED
     bench.close()
@@ -381,11 +379,11 @@ def test_ending_that_the_disk_refused_is_recorded_before_what_comes_next(
     if then == "scan":
         assert bench.until(bench.scan(wait=True).id).state is JobState.SUCCEEDED
     elif then == "close":
-        bench.runner.close()
+        bench.manager.close()
     elif then == "cancel":
-        assert bench.runner.cancel(scan_id).state is JobState.SUCCEEDED
+        assert bench.manager.cancel(scan_id).state is JobState.SUCCEEDED
     else:
-        bench.runner.delete(scan_id)
+        bench.manager.delete(scan_id)
         assert bench.store.page(before=None, limit=10) == []
         return
     assert bench.store.get(scan_id).state is JobState.SUCCEEDED
@@ -401,7 +399,7 @@ def test_worker_that_cannot_be_started_again_strands_no_scan(bench: Bench, monke
         raise OSError(errno.ENOMEM, message)
 
     monkeypatch.setattr(bench.worker, "start", start)
-    bench.runner.cancel(scan.id)
+    bench.manager.cancel(scan.id)
     assert bench.until(scan.id).state is JobState.CANCELLED
     bench.gate.set()
     assert bench.until(waiting.id).state is JobState.SUCCEEDED
@@ -463,9 +461,9 @@ def test_a_refused_record_poisons_no_later_scan(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Any, begins: int, lasting: int
 ) -> None:
     monkeypatch.setattr(database, "PATIENCE_S", 0.01)
-    monkeypatch.setattr(endings, "RETRY_S", 0.01)
+    monkeypatch.setattr(manager, "RETRY_S", 0.01)
     bench = Bench(tmp_path)
-    bench.runner.start()
+    bench.manager.start()
     real, writes = bench.store.database.changing, 0
     at: range = range(0)
 

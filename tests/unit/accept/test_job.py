@@ -13,11 +13,9 @@ import pytest
 
 from slrig.accept import running as acceptance
 from slrig.accept.asking import AcceptanceRequest
-from slrig.accept.desk import AcceptanceDesk
+from slrig.accept.job import AcceptanceTests
 from slrig.accept.plan import AcceptancePlan, usual_limits
 from slrig.accept.records import AcceptanceState, record_from_json, record_json
-from slrig.accept.report import write_reports
-from slrig.accept.running import evaluated
 from slrig.calibration.artefacts import Decision
 from slrig.devices import Rig
 from slrig.errors import (
@@ -36,30 +34,28 @@ from slrig.errors import (
 from slrig.failure import interruption_error, job_failure
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
-from slrig.jobs.records import JobKind, JobRecord
+from slrig.jobs.records import JobRecord
+from slrig.jobs.resume import resume
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration
 from tests.unit.accept.test_plan import VOLUME
 from tests.unit.accept.test_running import RIG, SHORT, take_scans_from
-from tests.unit.jobs.tame_queue import PowerCut, TameQueue
-from tests.unit.scan.bench import wait_for
+from tests.unit.jobs.tame_compute import TameCompute
+from tests.unit.jobs.tame_manager import PowerCut, TameManager
+from tests.unit.scan.bench import PIPELINE, wait_for
 from tests.unit.scan.fakes import TamePositioner, TameProjector
 
 PLAN = replace(SHORT, rendered=False)
 
 
-@pytest.fixture
-def queue() -> TameQueue:
-    positioner = TamePositioner(tuple(step.name for step in PLAN.steps))
-    return TameQueue(Rig("tame", {}, TameProjector(), {}, RIG, positioner=positioner))
+class Desk(AcceptanceTests):
+    """Tests whose measurements are over when they return."""
 
-
-class Desk(AcceptanceDesk):
-    """One whose measurements are over when they return."""
+    manager: TameManager
 
     def measure(self, test_id: UUID, **asked: Any) -> JobRecord:
         job = super().measure(test_id, **asked)
-        wait_for(self.jobs, job.id, lambda: self.jobs.get(job.id).state.final)
+        wait_for(self.manager.store, test_id, lambda: self.get(test_id).state is not AcceptanceState.MEASURING)
         return job
 
 
@@ -67,27 +63,36 @@ Desks = Callable[..., Desk]
 
 
 @pytest.fixture
-def desks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, queue: TameQueue) -> Iterator[Desks]:
-    """Makes the desk of a service, and of one after it over the same folder."""
+def desks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Desks]:
+    """Makes the tests of a service, and those of one after it over the same folder and rig."""
     folder = DataFolder(tmp_path)
-    database = Database(folder.database)
+    store = JobStore(Database(folder.database))
+    positioner = TamePositioner(tuple(step.name for step in PLAN.steps))
+    rig = Rig("tame", {}, TameProjector(), {}, RIG, positioner=positioner)
     take_scans_from(monkeypatch, PLAN)
 
     def make(*, tolerance_mm: float | None = None) -> Desk:
-        desk = Desk(
-            folder, queue, JobStore(database, JobKind.POSITION),
-            evaluate=evaluated, report=write_reports, tolerance_mm=tolerance_mm,
-        )  # fmt: skip
-        desk.take_up()
+        manager = TameManager(store, folder, rig, TameCompute(PIPELINE))
+        desk = Desk(manager, tolerance_mm=tolerance_mm)
+        desk.manager = manager
+        desk.settle()
+        resume(manager)
         return desk
 
     yield make
-    database.close()
+    store.database.close()
 
 
 @pytest.fixture
 def desk(desks: Desks) -> Desk:
     return desks()
+
+
+def moves(desk: Desk) -> list[int]:
+    """Where the artefacts were moved to."""
+    positioner = desk.manager.bare.positioner
+    assert isinstance(positioner, TamePositioner)
+    return positioner.moves
 
 
 def failure_code(desk: Desk, test_id: UUID) -> str | None:
@@ -108,7 +113,7 @@ def test_limits_follow_the_rig_file_unless_asked_for(desks: Desks) -> None:
     assert desks().open(asked.plan).plan.limits == usual_limits(VOLUME)
 
 
-def test_by_hand_one_position_is_measured_at_a_time_with_its_repeats(desk: Desk, queue: TameQueue) -> None:
+def test_by_hand_one_position_is_measured_at_a_time_with_its_repeats(desk: Desk) -> None:
     test = desk.open(the_plan)
     done = []
     while (record := desk.get(test.id)).state is AcceptanceState.OPEN:
@@ -118,11 +123,11 @@ def test_by_hand_one_position_is_measured_at_a_time_with_its_repeats(desk: Desk,
         done.append(following[0].name)
         desk.measure(test.id, wait=False, scripted=False)
     assert done == ["sphere-1", "sphere-2", "bar-1", "plane-1"]
-    assert queue.bare.positioner.moves == []  # type: ignore[union-attr]
+    assert moves(desk) == []
     assert desk.get(test.id).decision is Decision.PASSES
     assert desk.get(test.id).state is AcceptanceState.FINISHED
     assert desk.file(test.id, "report.html").is_file()
-    assert set(queue.holders) == {f"acceptance test {test.id}"}
+    assert set(desk.manager.holders) == {f"acceptance test {test.id}"}
     with pytest.raises(ScanStateError, match="is finished"):
         desk.measure(test.id, wait=False, scripted=False)
 
@@ -147,10 +152,10 @@ def test_a_position_that_went_wrong_may_be_measured_again(desk: Desk, monkeypatc
     assert len(desk.get(test.id).readings) == PLAN.repeats
 
 
-def test_a_cancelled_test_is_over(desk: Desk, queue: TameQueue) -> None:
+def test_a_cancelled_test_is_over(desk: Desk) -> None:
     waiting, running = desk.open(the_plan), desk.open(the_plan)
     assert desk.cancel(waiting.id).state is AcceptanceState.CANCELLED
-    queue.cancelled = lambda: True
+    desk.manager.cancelled = lambda: True
     desk.measure(running.id, wait=False, scripted=True)
     assert desk.get(running.id).state is AcceptanceState.CANCELLED
     with pytest.raises(ScanStateError, match="is cancelled"):
@@ -159,39 +164,39 @@ def test_a_cancelled_test_is_over(desk: Desk, queue: TameQueue) -> None:
         desk.file(running.id, "report.json")
 
 
-def test_what_cannot_be_tested_is_refused(desk: Desk, queue: TameQueue) -> None:
+def test_what_cannot_be_tested_is_refused(desk: Desk) -> None:
     with pytest.raises(JobNotFoundError, match="No acceptance test"):
         desk.get(uuid4())
     exact = desk.open(lambda *_: replace(PLAN, rendered=True))
     desk.measure(exact.id, wait=False, scripted=True)
     assert failure_code(desk, exact.id) == InvalidInputError.code
-    queue.bare.positioner.poses = ("sphere-1",)  # type: ignore[union-attr, misc]
+    desk.manager.bare.positioner.poses = ("sphere-1",)  # type: ignore[union-attr, misc]
     test = desk.open(the_plan)
-    queue.busy = "1"
+    desk.manager.busy = "1"
     with pytest.raises(RigBusyError):
         desk.measure(test.id, wait=False, scripted=False)
     assert desk.get(test.id).state is AcceptanceState.OPEN
-    queue.busy = None
+    desk.manager.busy = None
     desk.measure(test.id, wait=False, scripted=True)
     assert failure_code(desk, test.id) == UnsupportedByDeviceError.code
-    facts = queue.rig.facts
+    facts = desk.manager.rig.facts
     assert facts is not None
-    queue.rig.facts = replace(facts, calibration=None)
+    desk.manager.rig.facts = replace(facts, calibration=None)
     with pytest.raises(CalibrationError, match="has no calibration"):
         desk.open(the_plan)
-    queue.rig.facts = None
+    desk.manager.rig.facts = None
     with pytest.raises(DeviceBusyError, match="being opened"):
         desk.open(the_plan)
 
 
-def test_a_finished_test_and_its_report_outlive_the_service(desks: Desks, queue: TameQueue, tmp_path: Path) -> None:
+def test_a_finished_test_and_its_report_outlive_the_service(desks: Desks, tmp_path: Path) -> None:
     before = desks()
     waiting, test = before.open(the_plan), before.open(the_plan)
     before.measure(waiting.id, wait=False, scripted=False)
     before.measure(test.id, wait=False, scripted=True)
-    # A script measures all that are left in one loan of the rig.
-    assert len(queue.holders) == 2
-    assert queue.bare.positioner.moves == [0, 1, 2, 3]  # type: ignore[union-attr]
+    # A script measures all that are left, one after the other.
+    assert len(before.manager.holders) == 5
+    assert moves(before) == [0, 1, 2, 3]
     after = desks()
     for each in (waiting.id, test.id):
         assert record_json(after.get(each)) == record_json(before.get(each))
@@ -213,21 +218,20 @@ def test_a_finished_test_and_its_report_outlive_the_service(desks: Desks, queue:
 
 
 @pytest.mark.parametrize("ending", [PowerCut(), interruption_error()], ids=["killed", "ended in good order"])
-def test_test_that_was_cut_off_is_interrupted_and_goes_on(
-    desks: Desks, queue: TameQueue, ending: BaseException
-) -> None:
+def test_test_that_was_cut_off_is_interrupted_and_goes_on(desks: Desks, ending: BaseException) -> None:
     before = desks()
     test = before.open(the_plan)
+    asked = []
 
     def cancelled() -> bool:
-        if len(before.get(test.id).readings) == 1:
+        asked.append(1)
+        if len(asked) == 2:
             raise ending
         return False
 
-    queue.cancelled = cancelled
+    before.manager.cancelled = cancelled
     with suppress(PowerCut):
         before.measure(test.id, wait=False, scripted=True)
-    queue.cancelled = lambda: False
     stray = before._store.folder(test.id) / ".sphere-1-2"
     stray.mkdir(exist_ok=True)
     after = desks()
@@ -237,10 +241,10 @@ def test_test_that_was_cut_off_is_interrupted_and_goes_on(
     with pytest.raises(ArtefactNotReadyError, match="is interrupted"):
         after.file(test.id, "report.json")
     assert desks().get(test.id).state is AcceptanceState.INTERRUPTED
-    queue.bare.positioner.moves.clear()  # type: ignore[union-attr]
+    moves(after).clear()
     after.measure(test.id, wait=False, scripted=True)
     # Between repeats nothing may be moved: the first position is measured from its first capture on.
-    assert queue.bare.positioner.moves == [0, 1, 2, 3]  # type: ignore[union-attr]
+    assert moves(after) == [0, 1, 2, 3]
     assert after.get(test.id).state is AcceptanceState.FINISHED
     assert [each.take for each in after.get(test.id).readings if each.step == "sphere-1"] == [0, 1]
 
@@ -271,20 +275,20 @@ def test_links_among_the_tests_are_not_followed(desks: Desks, tmp_path: Path) ->
     assert (elsewhere / "test.json").is_file()
 
 
-def test_positions_of_one_test_are_measured_with_one_calibration(desk: Desk, queue: TameQueue) -> None:
+def test_positions_of_one_test_are_measured_with_one_calibration(desk: Desk) -> None:
     test = desk.open(the_plan)
     desk.measure(test.id, wait=False, scripted=False)
     camera = RIG.cameras["left"]
     other = replace(camera, translation_mm=camera.translation_mm + 1)
-    queue.bare = replace(queue.bare, calibration=Calibration({"left": other}, RIG.projector))
-    queue.rig.let_go()
+    desk.manager.bare = replace(desk.manager.bare, calibration=Calibration({"left": other}, RIG.projector))
+    desk.manager.rig.let_go()
     desk.measure(test.id, wait=False, scripted=False)
     assert failure_code(desk, test.id) == CalibrationStateError.code
     assert len(desk.get(test.id).readings) == PLAN.repeats
     assert desk.cancel(test.id).state is AcceptanceState.CANCELLED
 
 
-def test_a_test_under_way_is_not_deleted(desk: Desk, queue: TameQueue) -> None:
+def test_a_test_under_way_is_not_deleted(desk: Desk) -> None:
     test = desk.open(the_plan)
     refused: list[str] = []
 
@@ -294,7 +298,7 @@ def test_a_test_under_way_is_not_deleted(desk: Desk, queue: TameQueue) -> None:
         refused.append("refused")
         return True
 
-    queue.cancelled = cancelled
+    desk.manager.cancelled = cancelled
     desk.measure(test.id, wait=False, scripted=True)
     assert refused
     desk.delete(test.id)

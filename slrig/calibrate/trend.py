@@ -8,6 +8,7 @@ from itertools import pairwise
 
 from markupsafe import Markup
 
+from slrig.calibrate.verification import VerificationRecord
 from slrig.calibration.health import THRESHOLDS, HealthState, Thresholds
 from slrig.reports.drawing import shape
 from slrig.reports.trend import (
@@ -28,7 +29,6 @@ from slrig.reports.trend import (
     trend,
     x_of,
 )
-from slrig.verify.store import VerificationRecord
 
 HEIGHT = 470.0
 _COLOURS = {HealthState.GOOD: GREEN, HealthState.WATCH: ORANGE, HealthState.STALE: RED, HealthState.UNKNOWN: GREY}

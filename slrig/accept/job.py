@@ -1,0 +1,295 @@
+"""Acceptance tests on a running service: opened, measured position by position or by script, and kept. No HTTP here."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+from uuid import UUID, uuid4
+
+from slrig.accept import running
+from slrig.accept.evaluation import Reading
+from slrig.accept.plan import AcceptancePlan, takes_of
+from slrig.accept.records import AcceptanceRecord, AcceptanceState, with_jobs
+from slrig.accept.running import bundle_name, by_positioner, capture_take, required_calibration
+from slrig.accept.store import READINGS, AcceptanceStore, read_test, readings_json
+from slrig.accept.verdicts import AcceptanceResult, verdicts
+from slrig.bundle import write_file
+from slrig.disk import storage_errors
+from slrig.errors import (
+    ArtefactNotReadyError,
+    CalibrationError,
+    CalibrationStateError,
+    DeviceBusyError,
+    InvalidInputError,
+    JobNotFoundError,
+    ScanCancelledError,
+    ScanStateError,
+)
+from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.job import Job, JobRun, Outcome
+from slrig.jobs.manager import JobManager
+from slrig.jobs.records import Clock, Holder, JobKind, JobRecord, utc_now
+from slrig.jobs.worker_process import Task
+from slrig.model import Calibration
+from slrig.rig.session import RigSession
+from slrig.scan.plan import ProgressCallback
+
+
+@dataclass(frozen=True, slots=True)
+class PositionJob(Job):
+    """One position of an acceptance test, the `group`, with its repeats. scripted : the rig's positioner brings the
+    artefact there, and the next position follows; else it stands in its place.
+    """
+
+    kind: ClassVar[JobKind] = JobKind.POSITION
+    promises: ClassVar[tuple[str, ...]] = (READINGS,)
+    noun: ClassVar[str] = "evaluation of the position"
+
+    group: UUID
+    step: str
+    scripted: bool = False
+
+    @property
+    def capture_share(self) -> float:
+        """See `Job`."""
+        return 0.5
+
+    def capture(self, rig: RigSession, run: JobRun) -> None:
+        """Have the artefact placed, and record a bundle of each capture."""
+        opened, record = rig.open(), read_test(_test_of(run))
+        plan = record.plan
+        if required_calibration(opened).solve_id != record.calibration:
+            message = (
+                f"Acceptance test {record.id} is of calibration {record.calibration}, and the rig now uses "
+                f"{required_calibration(opened).solve_id}. Activate the first again, or open a new test."
+            )
+            raise CalibrationStateError(message)
+        if plan.rendered and opened.truth() is None:
+            message = "exact artefacts are those of a rendered rig, and this one is not; send the certificates' values"
+            raise InvalidInputError(message)
+        takes = takes_of(plan, self.step)
+        if self.scripted:
+            run.report(f"{self.step}: place", 0.0, takes[0][0].words)
+            by_positioner(opened, plan)(opened, takes[0][0])
+        with storage_errors(run.recording):
+            run.recording.mkdir()
+        for step, take in takes:
+            if run.cancelled():
+                message = f"the acceptance test was cancelled before {step.name}; what was measured before is kept"
+                raise ScanCancelledError(message)
+            # A repeat is captured without a move, so that it shows the scanner's scatter alone.
+            capture_take(
+                opened, plan, run.recording / bundle_name(step, take),
+                progress=self._progress(run, take, len(takes)), cancelled=run.cancelled,
+            )  # fmt: skip
+
+    def compute(self, run: JobRun) -> Outcome:
+        """Measure the artefact in each capture."""
+        plan = read_test(_test_of(run)).plan
+        takes, readings = takes_of(plan, self.step), list[Reading]()
+        for step, take in takes:
+            found = running.evaluated(
+                run.bundle / bundle_name(step, take), run.folder, plan, step, take,
+                progress=self._progress(run, take, len(takes)), cancelled=run.cancelled,
+            )  # fmt: skip
+            readings.append(found)
+        # Where the points of a test lie, which is where this folder goes to.
+        with storage_errors(run.folder):
+            for file in (run.folder / "positions" / self.step).iterdir():
+                file.rename(run.folder / file.name)
+            shutil.rmtree(run.folder / "positions")
+            shutil.rmtree(run.bundle)
+        write_file(run.folder / READINGS, readings_json(readings))
+        return Outcome({"captures_done": len(readings)})
+
+    def place(self, data: DataFolder, job_id: UUID) -> Path:  # noqa: ARG002 - as it is called
+        """See `Job`."""
+        return data.root / "acceptance" / str(self.group) / "positions" / self.step
+
+    def _progress(self, run: JobRun, take: int, takes: int) -> ProgressCallback:
+        def progress(stage: str, fraction: float, detail: str, /) -> None:
+            run.report(f"{self.step}: {stage}", (take + min(max(fraction, 0.0), 1.0)) / takes, detail)
+
+        return progress
+
+
+def write_test_report(result: AcceptanceResult, folder: Path) -> None:
+    """Write the reports of a test, in the worker."""
+    from slrig.accept.report import write_reports
+
+    write_reports(result, folder)
+
+
+class AcceptanceTests:
+    """The tests of one service, those of earlier runs among them: the `Group` of positions. Any thread may call. Raises
+    StorageError.
+    """
+
+    def __init__(self, manager: JobManager, *, tolerance_mm: float | None = None, clock: Clock = utc_now) -> None:
+        """tolerance_mm : what a point may be wrong by in what the rig is for, by the rig file."""
+        self._manager = manager
+        self._store = AcceptanceStore(manager.data)
+        self._clock, self._wanted_mm = clock, tolerance_mm
+        self._lock = threading.RLock()
+        self._tests = {record.id: record for record in self._store.load()}
+        # Of those that are measured by script in this run of the service.
+        self._holders: dict[UUID, Holder] = {}
+        manager.groups[JobKind.POSITION] = self
+
+    def settle(self) -> None:
+        """Forget jobs of tests that are gone. At the start, before jobs are gone on with."""
+        for test_id in self._manager.store.by_parent(JobKind.POSITION).keys() - self._tests.keys():
+            self._manager.store.delete_of(test_id)
+
+    def open(self, plan_of: Callable[[Calibration, float | None], AcceptancePlan]) -> AcceptanceRecord:
+        """Open a test of the rig as it is calibrated now, and of what its rig file wants. Touches no device.
+
+        Raises DeviceBusyError if the rig is not open yet, CalibrationError if it has no calibration, InvalidInputError
+        if the plan cannot be done; StorageError.
+        """
+        with self._lock:
+            rig = self._manager.rig
+            if rig.facts is None:
+                message = "The rig is being opened. Ask again in a moment."
+                raise DeviceBusyError(message)
+            calibration = rig.facts.calibration if rig.active is None else rig.active.calibration
+            if calibration is None:
+                message = f"rig '{rig.name}' has no calibration, and nothing can be measured; calibrate it first"
+                raise CalibrationError(message)
+            number = 1 + max((each.number for each in self._tests.values()), default=0)
+            plan = plan_of(calibration, self._wanted_mm)
+            record = AcceptanceRecord(number, uuid4(), self._clock(), rig.name, calibration.solve_id, plan)
+            self._store.save(record)
+            self._tests[record.id] = record
+        return record
+
+    def get(self, test_id: UUID) -> AcceptanceRecord:
+        """Return a test. Raises JobNotFoundError."""
+        with self._lock:
+            return with_jobs(self._found(test_id), self._manager.store.of(test_id))
+
+    def latest(self) -> tuple[AcceptanceRecord, ...]:
+        """Return all tests, newest first."""
+        with self._lock:
+            jobs = self._manager.store.by_parent(JobKind.POSITION)
+            return tuple(with_jobs(record, jobs.get(record.id, ())) for record in reversed(self._tests.values()))
+
+    def measure(
+        self, test_id: UUID, *, wait: bool, scripted: bool, key: str | None = None, holder: Holder | None = None
+    ) -> JobRecord:
+        """Have the next position measured, or, scripted, all that are left; return the job at once.
+
+        By hand, the artefact is to stand in its place. `wait` lets it stand in line behind other work. key : the
+        idempotency key of the request, reserved. holder : whom a refusal names meanwhile; None the test.
+
+        Raises JobNotFoundError, ScanStateError if there is no such test, or it is being measured, or it is over;
+        RigBusyError, QueueFullError, DeviceError as a scan.
+        """
+        with self._lock:
+            record = self.get(test_id)
+            if not record.state.waiting:
+                message = f"Acceptance test {test_id} is {record.state}; a position is measured while it is open."
+                raise ScanStateError(message)
+            begun = record.from_first_take()
+            # All were measured, and only the decision is missing: the last position is measured once more.
+            step = (begun.next_take or record.plan.takes[-1])[0].name
+            job = PositionJob(test_id, step, scripted)
+            if holder is not None:
+                self._holders[test_id] = holder
+            return self._manager.submit(job, wait=wait, key=key, holder=holder)[0]
+
+    def cancel(self, test_id: UUID) -> AcceptanceRecord:
+        """End a test. Returns at once; one that is over stays so. Raises JobNotFoundError, StorageError."""
+        with self._lock:
+            if self.get(test_id).state.waiting:
+                self._change(test_id, state=AcceptanceState.CANCELLED)
+            under_way = [job.id for job in self._manager.store.of(test_id) if not job.state.final]
+        for job_id in under_way:
+            self._manager.cancel(job_id)
+        return self.get(test_id)
+
+    def delete(self, test_id: UUID) -> None:
+        """Forget a test and remove its files. Raises JobNotFoundError, ScanStateError, StorageError."""
+        with self._lock:
+            if self.get(test_id).state is AcceptanceState.MEASURING:
+                message = f"Acceptance test {test_id} is being measured. Cancel it, then delete it."
+                raise ScanStateError(message)
+            self._store.delete(test_id)
+            del self._tests[test_id]
+            self._manager.store.delete_of(test_id)
+
+    def file(self, test_id: UUID, name: str) -> Path:
+        """Return where a report lies. Raises JobNotFoundError, ArtefactNotReadyError."""
+        record = self.get(test_id)
+        path = self._store.folder(test_id) / name
+        if record.state is not AcceptanceState.FINISHED or not self._manager.data.owns(path):
+            reason = f"has no {name} before every position is measured."
+            message = f"Acceptance test {test_id} is {record.state}, and {reason}"
+            raise ArtefactNotReadyError(message)
+        return path
+
+    def _found(self, test_id: UUID) -> AcceptanceRecord:
+        """A test as it is on disk."""
+        with self._lock:
+            record = self._tests.get(test_id)
+        if record is None:
+            message = f"No acceptance test {test_id} is on record here. GET /acceptance lists those that are."
+            raise JobNotFoundError(message)
+        return record
+
+    def captured(self, job: Job, job_id: UUID) -> None:
+        """See `Group`."""
+
+    def ended(self, job: Job, job_id: UUID, outcome: Outcome | None) -> Outcome:  # noqa: ARG002 - as it is called
+        """See `Group`: the readings of a position are on record, and what follows is begun."""
+        if not isinstance(job, PositionJob):
+            raise TypeError(job)
+        if outcome is None:
+            return Outcome()
+        with self._lock:
+            record = self._found(job.group)
+            new = self._store.readings(job.group, job.step)
+            others = {(each.step, each.take): each for each in record.readings if each.step != job.step}
+            found = {**others, **{(each.step, each.take): each for each in new}}
+            takes = [(step.name, take) for step, take in record.plan.takes]
+            record = self._change(job.group, readings=tuple(found[each] for each in takes if each in found))
+        following = record.next_take
+        if following is None:
+            self._conclude(record)
+        elif job.scripted:
+            next_job, holder = PositionJob(job.group, following[0].name, scripted=True), self._holders.get(job.group)
+            self._manager.add(next_job, holder=holder)
+        return Outcome({"captures_done": len(record.readings)})
+
+    def _conclude(self, record: AcceptanceRecord) -> None:
+        """Decide, and write the reports: every position is measured."""
+        calibration = self._manager.rig.calibration
+        if calibration is None or calibration.solve_id != record.calibration:
+            # It is no longer in use; the test is open until it is again.
+            return
+        result = AcceptanceResult(
+            record.rig, record.created_at, self._clock(), record.plan, calibration, record.readings,
+            verdicts(record.readings, record.plan),
+        )  # fmt: skip
+        given = (result, self._store.folder(record.id))
+        self._manager.worker.run(Task(write_test_report, given, what="report of the acceptance test"))
+        self._change(record.id, state=AcceptanceState.FINISHED, decision=result.decision)
+
+    def _change(self, test_id: UUID, **changes: Any) -> AcceptanceRecord:
+        """Put a change on record, and return the test. Raises StorageError, and changes nothing then."""
+        with self._lock:
+            changed = replace(self._found(test_id), **changes)
+            self._store.save(changed)
+            self._tests[test_id] = changed
+            return changed
+
+
+def _test_of(run: JobRun) -> Path:
+    """The folder of the test that a position belongs to."""
+    if run.place is None:
+        raise ValueError(run)
+    return run.place.parent.parent

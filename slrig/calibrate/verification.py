@@ -1,0 +1,296 @@
+"""A calibration verified by one pose of the board or by a scan: as a job, and the history of the rig's health."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, ClassVar
+from uuid import UUID, uuid4
+
+import structlog
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from slrig.bundle import read_calibration
+from slrig.calibrate.records import USUAL_PATTERNS
+from slrig.calibration import Board
+from slrig.calibration.health import (
+    Health,
+    HealthState,
+    Verification,
+    judge_health,
+    verification_from_document,
+    verification_from_scan,
+)
+from slrig.errors import CalibrationStateError, PoseRefusedError, UnsupportedByDeviceError
+from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.database import Database
+from slrig.jobs.job import Job, JobRun, Outcome, Recording
+from slrig.jobs.records import Clock, JobKind, utc_now
+from slrig.jobs.tables import VerificationRow
+from slrig.model import Calibration
+from slrig.rig.session import RigSession
+from slrig.scan.acquisition import capture_frames
+from slrig.scan.artefacts import REPORT
+from slrig.scan.plan import ScanPlan
+from slrig.scan.plan_check import check_plan
+
+_STILL_PX = 0.3
+_TREND = 60
+_KEPT = 20_000
+
+_UNCALIBRATED = (
+    "The rig has no calibration that could be verified. Calibrate it (POST /calibration), activate the result, then "
+    "verify that."
+)
+
+_log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class VerificationJob(Job):
+    """One pose of the board, by which the calibration in use is judged. position : of the positioner, by its number;
+    None leaves the board where it is.
+    """
+
+    kind: ClassVar[JobKind] = JobKind.VERIFICATION
+    noun: ClassVar[str] = "verification"
+
+    board: Board
+    position: int | None = None
+    exposure_s: float | None = None
+
+    def check(self, rig: RigSession) -> int:
+        """See `Job`.
+
+        Raises CalibrationStateError if the rig has no calibration; UnsupportedByDeviceError if it has no positioner, or
+        not that position; PatternError.
+        """
+        if rig.facts is None:
+            return 0
+        rig.refuse_misfit()
+        if rig.calibration is None:
+            raise CalibrationStateError(_UNCALIBRATED)
+        if self.position is not None and not 0 <= self.position < len(rig.facts.positions):
+            message = f"position: found {self.position}, this rig has {len(rig.facts.positions)} of them"
+            raise UnsupportedByDeviceError(message)
+        return check_plan(self._scan, rig.facts)
+
+    def capture(self, rig: RigSession, run: JobRun) -> Recording:
+        """Move the board if asked, and record a bundle with the calibration that is to be verified."""
+        opened = rig.open()
+        if self.position is not None and opened.positioner is not None:
+            opened.positioner.move(self.position)
+        # A verification must not use what a rendered rig knows of its scene.
+        bare = replace(opened, head=None)
+        return capture_frames(bare, self._scan, run.recording, progress=run.report, cancelled=run.cancelled)
+
+    def compute(self, run: JobRun) -> Outcome:
+        """Read the board, and hold the calibration against it."""
+        calibration = read_calibration(run.bundle / "calibration.json")
+        found = verify_bundle(run.bundle, self.board, calibration)
+        return Outcome({"calibration": calibration.solve_id, "found": found.document()})
+
+    @property
+    def _scan(self) -> ScanPlan:
+        """The patterns of one pose."""
+        return ScanPlan(patterns=USUAL_PATTERNS, exposure_s=self.exposure_s)
+
+
+def verify_bundle(folder: Path, board: Board, calibration: Calibration) -> Verification:
+    """Judge a calibration by a recorded pose of the board.
+
+    Raises PoseRefusedError if the board is not to be seen, or moved while it was shot; CalibrationError if the
+    calibration is of other cameras; BundleError, PatternError if the frames are no sound capture.
+    """
+    # Late: the service knows these values, and loads no mathematics.
+    from slrig.calibrate.pose_reading import read_pose
+    from slrig.calibration.health.verification import verify_by_board
+
+    pose = read_pose(folder, board, folder.name)
+    for name, figures in pose.figures.items():
+        if figures.moved_px > _STILL_PX:
+            lost = math.isinf(figures.moved_px)
+            how = "is not in every frame" if lost else f"moved by {figures.moved_px:.2f} px while it was shot"
+            message = (
+                f"camera '{name}': the board {how}, and a movement of more than {_STILL_PX} px would be taken for "
+                "a change of the rig; put it on a stand, and shoot it again"
+            )
+            raise PoseRefusedError(message)
+    return verify_by_board([pose.observation], board, calibration)
+
+
+def require_healthy(health: Health, *, refuse_when_stale: bool) -> None:
+    """Refuse a scan with a stale calibration, if the rig file says so. Raises CalibrationStateError."""
+    if refuse_when_stale and health.state is HealthState.STALE:
+        message = (
+            f"The calibration is stale, and this rig's file has scans refused then: {'; '.join(health.reasons)}. "
+            f"What to do: {health.remedy or 'calibrate again'}. To scan all the same, set refuse_when_stale = false in "
+            "the rig file."
+        )
+        raise CalibrationStateError(message)
+
+
+def health_stamp(health: Health, latest: VerificationRecord | None) -> dict[str, Any]:
+    """The section `health` of a scan's report: what the rig's health was when it was scanned."""
+    return {
+        "state": str(health.state),
+        "reasons": list(health.reasons),
+        "verified_at": None if latest is None else latest.at.isoformat(timespec="seconds"),
+        "verification": None if latest is None else str(latest.id),
+        "expected_error_mm": None if latest is None else latest.found.expected_mm,
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class VerificationRecord:
+    """One verification on record. number : rises; calibration : the id of the solve, or a digest of the numbers.
+
+    health : what was made of it and of those before it, at its time.
+    """
+
+    number: int
+    id: UUID
+    at: datetime
+    calibration: str
+    found: Verification
+    health: Health
+
+    def document(self) -> dict[str, Any]:
+        """As JSON values."""
+        return {
+            "id": str(self.id),
+            "at": self.at.astimezone(UTC).isoformat(timespec="milliseconds"),
+            "calibration": self.calibration,
+            "state": str(self.health.state),
+            "reasons": list(self.health.reasons),
+            "remedy": self.health.remedy,
+            **self.found.document(),
+        }
+
+
+class HealthStore:
+    """Verifications. Safe to call from any thread and from several processes."""
+
+    def __init__(self, database: Database) -> None:
+        self.database = database
+
+    def add(self, found: Verification, *, calibration: str, at: datetime) -> VerificationRecord:
+        """Judge a verification with those before it of its calibration, and put it on record. Raises StorageError."""
+        with self.database.changing() as session:
+            newest = session.scalar(select(VerificationRow).order_by(VerificationRow.number.desc()).limit(1))
+            query = select(VerificationRow).where(VerificationRow.calibration == calibration)
+            # The first few too: a trend starts from them.
+            first = list(session.scalars(query.order_by(VerificationRow.number).limit(3)))
+            last = list(session.scalars(query.order_by(VerificationRow.number.desc()).limit(_TREND)))
+            rows = {row.number: row for row in [*first, *reversed(last)]}
+            health = judge_health([*(verification_from_document(rows[number].found) for number in sorted(rows)), found])
+            row = VerificationRow(
+                id=str(uuid4()), at=_stamp(at), calibration=calibration, kind=found.kind, state=str(health.state),
+                reasons=list(health.reasons), remedy=health.remedy, found=found.document(),
+            )  # fmt: skip
+            session.add(row)
+            session.flush()
+            for old in session.scalars(select(VerificationRow).where(VerificationRow.number <= row.number - _KEPT)):
+                session.delete(old)
+            record = _record(row)
+            self.added(session, None if newest is None else _record(newest), record)
+            return record
+
+    def added(self, session: Session, before: VerificationRecord | None, now: VerificationRecord) -> None:
+        """Called in the transaction that puts a verification on record. before : the one before it, of any calibration.
+
+        For those who tell of it.
+        """
+
+    def history(self, *, limit: int = 200, since: datetime | None = None) -> Sequence[VerificationRecord]:
+        """Up to `limit` verifications, newest first, none older than `since`."""
+        query = select(VerificationRow)
+        if since is not None:
+            query = query.where(VerificationRow.at >= _stamp(since))
+        with self.database.reading() as session:
+            return [_record(row) for row in session.scalars(query.order_by(VerificationRow.number.desc()).limit(limit))]
+
+    def latest(self) -> VerificationRecord | None:
+        """The newest verification; None where there is none."""
+        return next(iter(self.history(limit=1)), None)
+
+    def since_calibration(self, calibration: str, *, limit: int = 1000) -> Sequence[VerificationRecord]:
+        """The verifications of one calibration, oldest first; the newest `limit` of them."""
+        query = select(VerificationRow).where(VerificationRow.calibration == calibration)
+        with self.database.reading() as session:
+            rows = session.scalars(query.order_by(VerificationRow.number.desc()).limit(limit))
+            return [_record(row) for row in rows][::-1]
+
+    def health_of(self, calibration: str) -> Health:
+        """What the last verification of a calibration came to; unknown where there was none."""
+        found = self.since_calibration(calibration, limit=1)
+        return found[-1].health if found else judge_health([])
+
+
+def _record(row: VerificationRow) -> VerificationRecord:
+    health = Health(HealthState(row.state), tuple(row.reasons), row.remedy)
+    found, at = verification_from_document(row.found), datetime.fromisoformat(row.at)
+    return VerificationRecord(row.number, UUID(row.id), at, row.calibration, found, health)
+
+
+def _stamp(moment: datetime) -> str:
+    # One zone and one length: the texts sort as the moments do.
+    return moment.astimezone(UTC).isoformat(timespec="milliseconds")
+
+
+class RigHealth:
+    """What is known of the calibration in use: see `Group`. It learns from verifications and from scans. Any thread may
+    call.
+
+    store : the history. A verification's summary is `VerificationRecord.document` of what was found.
+    """
+
+    def __init__(self, rig: RigSession, store: HealthStore, data: DataFolder, *, clock: Clock = utc_now) -> None:
+        self.store = store
+        self._rig = rig
+        self._data = data
+        self._clock = clock
+        # Scans carry it.
+        rig.health = self.stamp
+
+    def stamp(self) -> dict[str, Any] | None:
+        """The health now, as a scan's report has it; None where nothing was verified yet."""
+        health, latest, _ = self.health()
+        return None if latest is None else health_stamp(health, latest)
+
+    def health(self) -> tuple[Health, VerificationRecord | None, Calibration | None]:
+        """The health of the calibration in use, the verification that it rests on, and that calibration."""
+        active, facts = self._rig.active, self._rig.facts
+        calibration = active.calibration if active is not None else None if facts is None else facts.calibration
+        if calibration is None:
+            unknown = Health(HealthState.UNKNOWN, ("the rig has no calibration, or is not open yet",), "calibrate it")
+            return unknown, None, None
+        found = self.store.since_calibration(calibration.solve_id, limit=1)
+        return self.store.health_of(calibration.solve_id), found[-1] if found else None, calibration
+
+    def captured(self, job: Job, job_id: UUID) -> None:
+        """See `Group`."""
+
+    def ended(self, job: Job, job_id: UUID, outcome: Outcome | None) -> Outcome:
+        """See `Group`."""
+        if outcome is None or outcome.summary is None:
+            return outcome or Outcome()
+        if job.kind is JobKind.SCAN:
+            try:
+                self._note_scan(json.loads((self._data.scan(job_id) / REPORT).read_bytes()))
+            except Exception:  # noqa: BLE001 - the scan stands, whatever becomes of that
+                _log.exception("what a scan says of its calibration could not be noted")
+            return outcome
+        found, calibration = verification_from_document(outcome.summary["found"]), outcome.summary["calibration"]
+        return Outcome(self.store.add(found, calibration=calibration, at=self._clock()).document())
+
+    def _note_scan(self, report: dict[str, Any]) -> None:
+        _, _, calibration = self.health()
+        found = verification_from_scan(report["redundancy"].get("residual_px") or ())
+        if found is not None and calibration is not None:
+            self.store.add(found, calibration=calibration.solve_id, at=self._clock())

@@ -1,0 +1,123 @@
+"""What the service does first: bring records and files together again after whatever ended the last run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from uuid import UUID
+
+import structlog
+
+from slrig.errors import StorageError
+from slrig.failure import interruption_error, job_failure
+from slrig.jobs.data_folder import BUNDLE, missing_files, remove
+from slrig.jobs.job import Job, Outcome
+from slrig.jobs.manager import JobManager
+from slrig.jobs.records import JobRecord, JobState, acting_as, read_record
+
+_log = structlog.get_logger(__name__)
+
+
+def resume(manager: JobManager) -> None:
+    """Settle every job that the last run left open, or have it go on. Once, before the manager starts.
+
+    - A job whose files are in their place had only its end missing on record.
+    - One that waited waits again. One that computed is computed once more, from the frames that it has; what has ended
+      the service in the middle of the second attempt, too, may lie in those.
+    - Any other was interrupted; its frames are kept if it keeps them and all had come.
+    - A deletion that was cut off is completed.
+    - A job that succeeded and lacks files is recorded as failed.
+    - Files of a finished job without a record, as beside a database that was lost, are on record again, as they say
+      themselves; other files without a record are put aside in `.orphans`.
+    """
+    store, data = manager.store, manager.data
+    going_on = set()
+    for record in store.unfinished():
+        job = manager.kinds[record.kind].from_record(record)
+        # What is not ready is gone on with by its group.
+        if not job.ready or _went_on(manager, record, job):
+            going_on.add(str(record.id))
+    for record in store.finished():
+        _settle_finished(manager, record)
+    for leftover in data.incoming.iterdir():
+        if leftover.name not in going_on:
+            remove(leftover)
+    for kind in manager.kinds.values():
+        _restore(manager, kind)
+
+
+def _went_on(manager: JobManager, record: JobRecord, job: Job) -> bool:
+    """Have a job go on, or settle it; return whether it goes on."""
+    store, data = manager.store, manager.data
+    place, group = job.place(data, record.id), manager.groups.get(record.kind)
+    kept = None if place is None else read_record(place)
+    if kept is not None and kept.id == record.id and place is not None and not missing_files(place, job.promises):
+        outcome = Outcome(kept.summary, kept.fault)
+        if group is not None:
+            outcome = group.ended(job, record.id, outcome)
+        state = JobState.SUCCEEDED if outcome.fault is None else JobState.FAILED
+        store.finish(record.id, state, fault=outcome.fault, summary=outcome.summary)
+        _note(record, "recovered")
+        return False
+    whole = not job.uses_rig or data.owns(data.staging(record.id) / BUNDLE)
+    captured = record.state is JobState.COMPUTING and whole
+    # What uses no rig has waited, also while its views were shot.
+    waited = record.state is JobState.QUEUED or (not job.uses_rig and not captured)
+    if waited or (captured and store.attempts(record.id) == 1):
+        manager.begin(job, record, captured=captured)
+        _note(record, "taken up again")
+        return True
+    if captured and job.keeps_bundle:
+        manager.keep_bundle(job, record.id)
+    if group is not None:
+        group.ended(job, record.id, None)
+    store.finish(record.id, JobState.INTERRUPTED, fault=job_failure(interruption_error()))
+    _note(record, "interrupted")
+    return False
+
+
+def _settle_finished(manager: JobManager, record: JobRecord) -> None:
+    store, data = manager.store, manager.data
+    job = manager.kinds[record.kind].from_record(record)
+    place = job.place(data, record.id)
+    if place is None or record.state is not JobState.SUCCEEDED:
+        return
+    missing = missing_files(place, job.promises)
+    if not missing:
+        return
+    if data.owns(data.staging(record.id)):
+        store.delete(record.id)
+        return
+    message = f"{' and '.join(missing)} of this {job.noun} is gone from {place}. Start it again."
+    store.lose_files(record.id, job_failure(StorageError(message)))
+    _note(record, "without files")
+
+
+def _restore(manager: JobManager, kind: type[Job]) -> None:
+    """Put finished jobs on record again, in the order of their making, and other files aside."""
+    store, data = manager.store, manager.data
+    known, found = set(store.states(kind.kind)), list[tuple[JobRecord, Path]]()
+    for place in kind.places(data):
+        kept = None if place.is_symlink() else read_record(place)
+        job_id = kept.id if kept is not None else _id_of(place)
+        if job_id in known:
+            continue
+        if kept is not None and kept.kind is kind.kind and not missing_files(place, kind.promises):
+            found.append((kept, place))
+        else:
+            data.put_aside(place)
+            _log.warning("left by the last run", files=place.name, found="put aside")
+    for kept, _ in sorted(found, key=lambda each: each[0].created_at):
+        with acting_as(kept.requested_by):
+            store.restore(kept)
+        _note(kept, "recovered")
+
+
+def _id_of(place: Path) -> UUID | None:
+    try:
+        return UUID(place.name)
+    except ValueError:
+        return None
+
+
+def _note(record: JobRecord, found: str) -> None:
+    _log.warning("left by the last run", kind=str(record.kind), job=str(record.id), found=found)

@@ -1,1 +1,0 @@
-"""Verifications of a calibration, and their history."""
