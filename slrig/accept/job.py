@@ -17,7 +17,7 @@ from slrig.accept.records import AcceptanceRecord, AcceptanceState, with_jobs
 from slrig.accept.running import bundle_name, by_positioner, capture_take, required_calibration
 from slrig.accept.store import READINGS, AcceptanceStore, read_test, readings_json
 from slrig.accept.verdicts import AcceptanceResult, verdicts
-from slrig.bundle import write_file
+from slrig.bundle import CALIBRATION, read_calibration, write_calibration, write_file
 from slrig.disk import storage_errors
 from slrig.errors import (
     ArtefactNotReadyError,
@@ -29,14 +29,15 @@ from slrig.errors import (
     ScanCancelledError,
     ScanStateError,
 )
-from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.data_folder import BUNDLE, DataFolder
 from slrig.jobs.job import Job, JobRun, Outcome
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import Clock, Holder, JobKind, JobRecord, utc_now
 from slrig.jobs.worker_process import Task
 from slrig.model import Calibration
 from slrig.rig.session import RigSession
-from slrig.scan.plan import ProgressCallback
+from slrig.scan.plan import ProgressCallback, ScanPlan
+from slrig.scan.plan_check import check_plan
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +53,15 @@ class PositionJob(Job):
     group: UUID
     step: str
     scripted: bool = False
+    captures: int = 1
+    exposure_s: float | None = None
+
+    def check(self, rig: RigSession) -> int:
+        """See `Job`. All captures of the position lie on the disk at once. Raises PatternError, CalibrationError."""
+        rig.refuse_misfit()
+        if rig.facts is None:
+            return 0
+        return self.captures * check_plan(ScanPlan(exposure_s=self.exposure_s), rig.facts, rig.calibration)
 
     @property
     def capture_share(self) -> float:
@@ -102,7 +112,6 @@ class PositionJob(Job):
             for file in (run.folder / "positions" / self.step).iterdir():
                 file.rename(run.folder / file.name)
             shutil.rmtree(run.folder / "positions")
-            shutil.rmtree(run.bundle)
         write_file(run.folder / READINGS, readings_json(readings))
         return Outcome({"captures_done": len(readings)})
 
@@ -138,6 +147,8 @@ class AcceptanceTests:
         self._tests = {record.id: record for record in self._store.load()}
         # Of those that are measured by script in this run of the service.
         self._holders: dict[UUID, Holder] = {}
+        # Those that are to end with the position that is measured.
+        self._cancelled: set[UUID] = set()
         manager.groups[JobKind.POSITION] = self
 
     def settle(self) -> None:
@@ -164,6 +175,7 @@ class AcceptanceTests:
             plan = plan_of(calibration, self._wanted_mm)
             record = AcceptanceRecord(number, uuid4(), self._clock(), rig.name, calibration.solve_id, plan)
             self._store.save(record)
+            write_calibration(self._store.folder(record.id) / CALIBRATION, calibration)
             self._tests[record.id] = record
         return record
 
@@ -197,16 +209,25 @@ class AcceptanceTests:
             begun = record.from_first_take()
             # All were measured, and only the decision is missing: the last position is measured once more.
             step = (begun.next_take or record.plan.takes[-1])[0].name
-            job = PositionJob(test_id, step, scripted)
+            job = self._position(record, step, scripted=scripted)
+            made = self._manager.submit(job, wait=wait, key=key, holder=holder)[0]
+            self._cancelled.discard(test_id)
             if holder is not None:
                 self._holders[test_id] = holder
-            return self._manager.submit(job, wait=wait, key=key, holder=holder)[0]
+            return made
+
+    def _position(self, record: AcceptanceRecord, step: str, *, scripted: bool) -> PositionJob:
+        plan = record.plan
+        return PositionJob(record.id, step, scripted, len(takes_of(plan, step)), plan.exposure_s)
 
     def cancel(self, test_id: UUID) -> AcceptanceRecord:
         """End a test. Returns at once; one that is over stays so. Raises JobNotFoundError, StorageError."""
         with self._lock:
-            if self.get(test_id).state.waiting:
+            state = self.get(test_id).state
+            if state.waiting:
                 self._change(test_id, state=AcceptanceState.CANCELLED)
+            elif state is AcceptanceState.MEASURING:
+                self._cancelled.add(test_id)
             under_way = [job.id for job in self._manager.store.of(test_id) if not job.state.final]
         for job_id in under_way:
             self._manager.cancel(job_id)
@@ -244,11 +265,12 @@ class AcceptanceTests:
     def captured(self, job: Job, job_id: UUID) -> None:
         """See `Group`."""
 
-    def ended(self, job: Job, job_id: UUID, outcome: Outcome | None) -> Outcome:  # noqa: ARG002 - as it is called
+    def ended(self, job: Job, job_id: UUID, outcome: Outcome | None) -> Outcome:
         """See `Group`: the readings of a position are on record, and what follows is begun."""
         if not isinstance(job, PositionJob):
             raise TypeError(job)
         if outcome is None:
+            self._holders.pop(job.group, None)
             return Outcome()
         with self._lock:
             record = self._found(job.group)
@@ -256,21 +278,25 @@ class AcceptanceTests:
             others = {(each.step, each.take): each for each in record.readings if each.step != job.step}
             found = {**others, **{(each.step, each.take): each for each in new}}
             takes = [(step.name, take) for step, take in record.plan.takes]
-            record = self._change(job.group, readings=tuple(found[each] for each in takes if each in found))
-        following = record.next_take
-        if following is None:
+            readings = tuple(found[each] for each in takes if each in found)
+            state = AcceptanceState.CANCELLED if job.group in self._cancelled else record.state
+            record = self._change(job.group, readings=readings, state=state)
+            self._cancelled.discard(job.group)
+            following = record.next_take
+            # After a kill the next one may be on record already.
+            begun = any(not each.state.final and each.id != job_id for each in self._manager.store.of(job.group))
+            if following is not None and job.scripted and record.state.waiting and not begun:
+                next_job = self._position(record, following[0].name, scripted=True)
+                self._manager.add(next_job, holder=self._holders.get(job.group))
+        self._manager.data.remove(self._store.folder(job.group) / "positions" / job.step / BUNDLE)
+        if following is None and record.state.waiting:
+            self._holders.pop(job.group, None)
             self._conclude(record)
-        elif job.scripted:
-            next_job, holder = PositionJob(job.group, following[0].name, scripted=True), self._holders.get(job.group)
-            self._manager.add(next_job, holder=holder)
         return Outcome({"captures_done": len(record.readings)})
 
     def _conclude(self, record: AcceptanceRecord) -> None:
         """Decide, and write the reports: every position is measured."""
-        calibration = self._manager.rig.calibration
-        if calibration is None or calibration.solve_id != record.calibration:
-            # It is no longer in use; the test is open until it is again.
-            return
+        calibration = read_calibration(self._store.folder(record.id) / CALIBRATION)
         result = AcceptanceResult(
             record.rig, record.created_at, self._clock(), record.plan, calibration, record.readings,
             verdicts(record.readings, record.plan),

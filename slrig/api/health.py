@@ -22,9 +22,6 @@ from slrig.calibration.health import THRESHOLDS, DriftEstimate, HealthState, Pai
 from slrig.errors import CalibrationError
 from slrig.jobs.records import JobKind, JobRecord, JobState, utc_now
 
-MOST_VERIFICATIONS = 1000
-"""Verifications whose job stays on record. What they found is kept longer, by `RigHealth`."""
-
 router = APIRouter(prefix="/rig", tags=["health"])
 
 
@@ -144,9 +141,7 @@ def verify_rig(
 
     def start(key: str | None) -> UUID:
         job = VerificationJob(board, request.position, request.exposure_s)
-        record = service.manager.submit(job, wait=request.if_busy == "queue", key=key)[0]
-        service.store.prune(JobKind.VERIFICATION, MOST_VERIFICATIONS)
-        return record.id
+        return service.manager.submit(job, wait=request.if_busy == "queue", key=key)[0].id
 
     body = _body(started_once(service.keys, service.store, idempotency_key, "/rig/verification", request, start))
     response.headers["Location"] = body.links["self"]

@@ -41,6 +41,9 @@ from slrig.schedule.tasks import Tasks
 
 _log = structlog.get_logger(__name__)
 
+_MOST_VERIFICATIONS = 1000
+"""Verifications whose job stays on record. What they found is kept longer, by `RigHealth`."""
+
 _SCHEDULE_END_S = 1.0
 """How long a scheduled run may take to end by itself before the runner ends it."""
 
@@ -120,8 +123,7 @@ class Service:
         finished, or something that is under way uses it.
         """
         self.store.get(scan_id, JobKind.SCAN)
-        with self.models.unused(scan_id):
-            self.manager.delete(scan_id)
+        self.manager.delete(scan_id, self.models.unused(scan_id))
 
     def _copier(self) -> Copier | None:
         """What tells the catalogue of this rig, if the settings name one. Raises ConfigError, ExtraMissingError."""
@@ -132,11 +134,13 @@ class Service:
         return Copier(catalogue, copies, told)
 
     def _ended(self, record: JobRecord) -> None:
-        """Measure a job that is over, and go on with the model of a view, and make room, after a scan."""
+        """Measure a job that is over, make room, and go on with the model that a scan is a view of."""
         if record.kind is JobKind.SCAN:
             self.shooting.view_ended(record)
             self.scan_retention.look()
         try:
+            if record.kind is JobKind.VERIFICATION:
+                self.store.prune(JobKind.VERIFICATION, _MOST_VERIFICATIONS)
             events = self.store.events(record.id, after=0)
             self.durations.ended(record, events)
             for observer in self.observers:

@@ -157,7 +157,6 @@ class Calibrations:
         *,
         wait: bool,
         key: str | None = None,
-        holder: Holder | None = None,
     ) -> PoseRecord:
         """Have poses of the positioner shot one after the other, and return the first; none means all of them.
 
@@ -170,7 +169,7 @@ class Calibrations:
             asked = positions or range(max(len(facts.positions) if facts is not None else 0, 1))
             first, *others = [place for each in asked if (place := _position(each, facts)[0]) is not None]
             exposed = PoseRequest(first, request.exposure_s)
-            pose = self.shoot(session_id, exposed, wait=wait, key=key, holder=holder)
+            pose = self.shoot(session_id, exposed, wait=wait, key=key)
             self._set_script(session_id, *others)
             return pose
 

@@ -97,6 +97,7 @@ class PoseJob(Job):
         except PoseRefusedError as error:
             # The number stands beside it; and the person shot it just now.
             judged = pose_judging.Judgement((str(error).removeprefix(f"pose 'pose {self.number}': "),), {}, None)
+        run.check()
         answer = {"refused": list(judged.refusals), "answer": judged.answer}
         with disk_errors(run.folder):
             write_durably(run.folder / ANSWER, (json.dumps(answer, indent=1, allow_nan=False) + "\n").encode())
@@ -147,9 +148,14 @@ class SolveJob(Job):
         record = with_poses_on_disk(read_session(session), session)
         setting, poses = setting_of(record), session_readings(session)
         compared = session / COMPARED
+
+        def report(stage: str, fraction: float, detail: str, /) -> None:
+            run.check()
+            run.report(stage, fraction, detail)
+
         result = solving.solve_poses(
             setting.board, setting.cameras, setting.projector, poses,
-            progress=run.report,
+            progress=report,
             earlier=read_calibration(compared) if compared.is_file() else None,
             board_shape=self.board_shape,
             tolerance_mm=self.tolerance_mm,

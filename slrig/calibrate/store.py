@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import shutil
 import uuid
 import zipfile
@@ -31,7 +30,7 @@ from slrig.calibration import BoardView, Correspondences, PoseObservation, ViewQ
 from slrig.errors import CalibrationError, StorageError
 from slrig.failure import disk_errors
 from slrig.jobs.data_folder import BUNDLE, DataFolder
-from slrig.jobs.records import read_record
+from slrig.jobs.records import JobRecord, read_record
 from slrig.model import Calibration
 from slrig.rig.session import ActiveCalibration
 
@@ -113,11 +112,11 @@ class CalibrationStore:
 
     def delete(self, session_id: UUID) -> None:
         """Remove a calibration with all its files: by one rename out of place first."""
-        self._remove(self.folder(session_id))
+        self._folder.remove(self.folder(session_id))
 
     def discard_pose(self, session_id: UUID, number: int) -> None:
         """Remove a pose. Idempotent."""
-        self._remove(self.pose(session_id, number))
+        self._folder.remove(self.pose(session_id, number))
 
     def stage_solve(self, session_id: UUID) -> Path:
         """Make a folder for the results of a solve."""
@@ -130,7 +129,7 @@ class CalibrationStore:
         """Move the results of a solve into place, whole and durable."""
         place = self.solve(session_id, number)
         # A run that was cut off between this and its record may have left one.
-        self._remove(place)
+        self._folder.remove(place)
         self._commit(staged, place)
 
     def discard(self, staged: Path) -> None:
@@ -197,14 +196,6 @@ class CalibrationStore:
             staged.rename(place)
             sync_folder(place.parent)
 
-    def _remove(self, place: Path) -> None:
-        if not os.path.lexists(place):
-            return
-        gone = self._folder.incoming / f"gone-{uuid.uuid4().hex}"
-        with disk_errors(place):
-            place.rename(gone)
-        self.discard(gone)
-
 
 def read_session(folder: Path) -> SessionRecord:
     """A session as its folder has it. Raises StorageError."""
@@ -213,14 +204,24 @@ def read_session(folder: Path) -> SessionRecord:
 
 
 def session_readings(folder: Path) -> list[ReadPose]:
-    """What was read of the accepted poses of a session, by their numbers. Raises StorageError."""
-    return [_read_reading(place) for place in sorted((folder / "poses").glob(f"*/{READING}"))]
+    """What was read of the accepted poses of a session, by their numbers. Raises StorageError: it cannot be read."""
+    return [_read_reading(_pose_place(folder, job) / READING) for job in _poses_on_disk(folder) if job.fault is None]
 
 
 def with_poses_on_disk(session: SessionRecord, folder: Path) -> SessionRecord:
     """A session with the poses in its folder, each as it was judged there."""
-    jobs = [read_record(place) for place in sorted((folder / "poses").iterdir())]
-    return replace(session, poses=tuple(pose_of(job) for job in jobs if job is not None))
+    return replace(session, poses=tuple(pose_of(job) for job in _poses_on_disk(folder)))
+
+
+def _poses_on_disk(folder: Path) -> list[JobRecord]:
+    """The poses in the folder of a session, by their numbers, without links and copies."""
+    places = sorted(place for place in (folder / "poses").iterdir() if not place.is_symlink())
+    found = [(read_record(place), place) for place in places]
+    return [job for job, place in found if job is not None and _pose_place(folder, job) == place]
+
+
+def _pose_place(folder: Path, job: JobRecord) -> Path:
+    return folder / "poses" / f"{job.plan['number']:02d}"
 
 
 _READ_PARTS: dict[str, type[Any]] = {"view": BoardView, "light": Correspondences, "figures": ViewQuality}

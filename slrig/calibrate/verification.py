@@ -179,9 +179,18 @@ class HealthStore:
     def __init__(self, database: Database) -> None:
         self.database = database
 
-    def add(self, found: Verification, *, calibration: str, at: datetime) -> VerificationRecord:
-        """Judge a verification with those before it of its calibration, and put it on record. Raises StorageError."""
+    def add(
+        self, found: Verification, *, calibration: str, at: datetime, job_id: UUID | None = None
+    ) -> VerificationRecord:
+        """Judge a verification with those before it of its calibration, and put it on record. Raises StorageError.
+
+        job_id : what has found it; what that has found before, as before a kill, stands.
+        """
         with self.database.changing() as session:
+            name = str(job_id or uuid4())
+            earlier = session.scalar(select(VerificationRow).where(VerificationRow.id == name))
+            if earlier is not None:
+                return _record(earlier)
             newest = session.scalar(select(VerificationRow).order_by(VerificationRow.number.desc()).limit(1))
             query = select(VerificationRow).where(VerificationRow.calibration == calibration)
             # The first few too: a trend starts from them.
@@ -190,7 +199,7 @@ class HealthStore:
             rows = {row.number: row for row in [*first, *reversed(last)]}
             health = judge_health([*(verification_from_document(rows[number].found) for number in sorted(rows)), found])
             row = VerificationRow(
-                id=str(uuid4()), at=_stamp(at), calibration=calibration, kind=found.kind, state=str(health.state),
+                id=name, at=_stamp(at), calibration=calibration, kind=found.kind, state=str(health.state),
                 reasons=list(health.reasons), remedy=health.remedy, found=found.document(),
             )  # fmt: skip
             session.add(row)
@@ -282,15 +291,15 @@ class RigHealth:
             return outcome or Outcome()
         if job.kind is JobKind.SCAN:
             try:
-                self._note_scan(json.loads((self._data.scan(job_id) / REPORT).read_bytes()))
+                self._note_scan(job_id, json.loads((self._data.scan(job_id) / REPORT).read_bytes()))
             except Exception:  # noqa: BLE001 - the scan stands, whatever becomes of that
                 _log.exception("what a scan says of its calibration could not be noted")
             return outcome
         found, calibration = verification_from_document(outcome.summary["found"]), outcome.summary["calibration"]
-        return Outcome(self.store.add(found, calibration=calibration, at=self._clock()).document())
+        return Outcome(self.store.add(found, calibration=calibration, at=self._clock(), job_id=job_id).document())
 
-    def _note_scan(self, report: dict[str, Any]) -> None:
+    def _note_scan(self, scan_id: UUID, report: dict[str, Any]) -> None:
         _, _, calibration = self.health()
         found = verification_from_scan(report["redundancy"].get("residual_px") or ())
         if found is not None and calibration is not None:
-            self.store.add(found, calibration=calibration.solve_id, at=self._clock())
+            self.store.add(found, calibration=calibration.solve_id, at=self._clock(), job_id=scan_id)

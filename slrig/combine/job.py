@@ -81,8 +81,12 @@ class ModelJob(Job):
         if run.place is None:
             raise ValueError(run)
         data, plan = run.place.parent.parent, self.plan
+        meshes = {str(scan): data / SCANS / str(scan) / MESH for scan in plan.scans}
+        for scan, mesh in meshes.items():
+            if not mesh.exists() or mesh.resolve() != (data / SCANS).resolve() / scan / MESH:
+                raise _mesh_gone(mesh, scan)
         combining.combine_into(
-            {str(scan): data / SCANS / str(scan) / MESH for scan in plan.scans},
+            meshes,
             run.folder,
             plan.poses,
             start_error_mm=plan.start_error_mm,
@@ -102,6 +106,10 @@ class ModelJob(Job):
     def places(cls, data: DataFolder) -> Iterable[Path]:
         """See `Job`."""
         return sorted(data.root.glob(f"{MODELS}/*"))
+
+
+def _mesh_gone(mesh: Path, scan: str) -> StorageError:
+    return StorageError(f"{mesh} is gone, or a link. Leave scan {scan} out, or bring its files back.")
 
 
 def turntable_planes(mesh: Path, axis: MeasuredAxis | None) -> tuple[TurntablePlane, ...]:
@@ -292,8 +300,7 @@ class Models:
     def _mesh(self, scan_id: UUID) -> Path:
         mesh = self._data.scan(scan_id) / MESH
         if not self._data.owns(mesh):
-            message = f"{mesh} is gone, or a link. Leave scan {scan_id} out, or bring its files back."
-            raise StorageError(message)
+            raise _mesh_gone(mesh, str(scan_id))
         return mesh
 
     def _angle_told(self, scan_id: UUID) -> tuple[float, str | None] | None:

@@ -297,7 +297,7 @@ class ViewShooting:
 
     def _require_space(self, views: Sequence[ScanJob]) -> None:
         """Raise StorageError unless there is room for all views."""
-        self._manager.data.require_space(sum(view.check(self._manager.rig) for view in views))
+        self._manager.require_space(sum(view.check(self._manager.rig) for view in views))
 
     def _waiting(self, model_id: UUID) -> tuple[JobRecord, ShootPlan, tuple[View, ...]]:
         """A model that waits for a hand. Raises JobNotFoundError, ScanStateError."""

@@ -13,6 +13,7 @@ from uuid import UUID
 from pydantic import TypeAdapter
 
 from slrig.capture import EvidenceSummary
+from slrig.errors import ScanCancelledError
 from slrig.failure import JobFailure
 from slrig.jobs.data_folder import BUNDLE, RESULT, DataFolder
 from slrig.jobs.frame_feed import FrameSink
@@ -66,6 +67,12 @@ class JobRun:
     evidence: EvidenceSummary | None = None
     where: Mapping[str, str] = field(default_factory=lambda: {"where": "local"})
     pipeline: Any = None
+
+    def check(self) -> None:
+        """Raise ScanCancelledError once the job is to end early."""
+        if self.cancelled():
+            message = "It was cancelled while it was computed."
+            raise ScanCancelledError(message)
 
     @property
     def recording(self) -> Path:

@@ -10,7 +10,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import Any, ClassVar, TypeVar
@@ -221,8 +221,7 @@ class JobManager:
         DeviceError
             A driver hangs.
         """
-        self.data.require_space(max(job.check(self.rig) for job in jobs) + self._spare_bytes)
-        works: list[_Work] = []
+        self.require_space(max(job.check(self.rig) for job in jobs))
         with self._changed:
             if jobs[0].uses_rig:
                 self._require_place(wait=wait)
@@ -230,7 +229,8 @@ class JobManager:
             records = self.record(*jobs, label=label, key=key)
             works = [self._work(job, record, holder) for job, record in zip(jobs, records, strict=True)]
             self._line_up(works)
-        self._previews.interrupt()
+        if jobs[0].uses_rig:
+            self._previews.interrupt()
         return records
 
     def lend(self, holder: Holder, use: Callable[[RigSession, Callable[[], bool]], _Result]) -> _Result:
@@ -250,6 +250,10 @@ class JobManager:
         result: _Result = loan.result
         return result
 
+    def require_space(self, needed_bytes: int) -> None:
+        """Raise StorageError unless there is room for so much, and for what is left free."""
+        self.data.require_space(needed_bytes + self._spare_bytes)
+
     def record(
         self, *jobs: Job, label: str | None = None, key: str | None = None, job_id: UUID | None = None
     ) -> list[JobRecord]:
@@ -260,9 +264,9 @@ class JobManager:
 
     def add(self, *jobs: Job, label: str | None = None, holder: Holder | None = None) -> list[JobRecord]:
         """Put jobs on record and have them done, however many wait: nobody is there to hear a refusal."""
-        records = self.record(*jobs, label=label)
-        for job, record in zip(jobs, records, strict=True):
-            self.begin(job, record, holder=holder)
+        with self._changed:
+            records = self.record(*jobs, label=label)
+            self._line_up([self._work(job, record, holder) for job, record in zip(jobs, records, strict=True)])
         return records
 
     def begin(self, job: Job, record: JobRecord, *, captured: bool = False, holder: Holder | None = None) -> None:
@@ -309,8 +313,12 @@ class JobManager:
             unwatch()
         return self.store.get(job_id)
 
-    def delete(self, job_id: UUID) -> None:
-        """Remove a job that is over: its record, its events, its files. Raises JobNotFoundError, ScanStateError."""
+    def delete(self, job_id: UUID, unused: AbstractContextManager[None] | None = None) -> None:
+        """Remove a job that is over: its record, its events, its files. Raises JobNotFoundError, ScanStateError.
+
+        unused : entered meanwhile; it raises where something else needs the job.
+        """
+        # Before `unused`: whoever hears of an end may want the locks that it holds.
         self.settle()
         record = self.store.get(job_id)
         if not record.state.final:
@@ -321,10 +329,11 @@ class JobManager:
             )
             raise ScanStateError(message)
         place = self.kinds[record.kind].from_record(record).place(self.data, job_id)
-        self.data.discard(job_id)
-        if place is not None:
-            self.data.withdraw(place, job_id)
-        self.store.delete(job_id)
+        with unused or nullcontext():
+            self.data.discard(job_id)
+            if place is not None:
+                self.data.withdraw(place, job_id)
+            self.store.delete(job_id)
         self.data.discard(job_id)
         _log.info("job deleted", kind=str(record.kind), job=str(job_id))
 
@@ -554,7 +563,7 @@ class JobManager:
             with driver_errors(rig.name):
                 rig.open()
                 # What the rig can do may not have been known before, and its calibration may have changed.
-                self.data.require_space(job.check(rig) + self._spare_bytes)
+                self.require_space(job.check(rig))
                 if job.feeds:
                     work.feed = self.worker.feed(job.region)
                 work.recording = job.capture(rig, self._run_of(work, self._progress(work, 0.0, job.capture_share)))
@@ -645,6 +654,7 @@ class JobManager:
         job, data = work.job, self.data
         data.clear_results(work.id)
         run = self._run_of(work, progress)
+        run.check()
         outcome: Outcome = self.worker.run(
             job_task(job, run), progress=run.report, cancelled=run.cancelled, made=run.file_ready, feed=work.feed
         )
@@ -668,7 +678,10 @@ class JobManager:
             write_record(self.data.staging(work.id), record)
             self.data.put(work.id, place)
         group = self.groups.get(work.job.kind)
-        return outcome if group is None else group.ended(work.job, work.id, outcome)
+        if group is None:
+            return outcome
+        with acting_as(self.store.get(work.id).requested_by):
+            return group.ended(work.job, work.id, outcome)
 
     def _run_of(self, work: _Work, progress: ProgressRecorder) -> JobRun:
         feed = work.feed
@@ -778,6 +791,8 @@ class JobManager:
         for end in ends:
             try:
                 made = self.store.finish(end.id, end.state, fault=end.outcome.fault, summary=end.outcome.summary)
+            except JobNotFoundError:
+                made = False
             except Exception as error:  # noqa: BLE001 - whatever refuses the record, the end is not lost
                 _log.error(
                     "the end of a job could not be recorded",

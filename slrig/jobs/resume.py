@@ -32,12 +32,19 @@ def resume(manager: JobManager) -> None:
     store, data = manager.store, manager.data
     going_on = set()
     for record in store.unfinished():
-        job = manager.kinds[record.kind].from_record(record)
-        # What is not ready is gone on with by its group.
-        if not job.ready or _went_on(manager, record, job):
+        try:
+            job = manager.kinds[record.kind].from_record(record)
+            # What is not ready is gone on with by its group.
+            goes_on = not job.ready or _went_on(manager, record, job)
+        except Exception:  # noqa: BLE001 - the others, and the service, go on all the same
+            _log.exception("a job could not be gone on with", job=str(record.id))
+            store.finish(record.id, JobState.INTERRUPTED, fault=job_failure(interruption_error()))
+            continue
+        if goes_on:
             going_on.add(str(record.id))
     for record in store.finished():
-        _settle_finished(manager, record)
+        if record.state is JobState.SUCCEEDED:
+            _require_files(manager, record)
     for leftover in data.incoming.iterdir():
         if leftover.name not in going_on:
             remove(leftover)
@@ -53,7 +60,8 @@ def _went_on(manager: JobManager, record: JobRecord, job: Job) -> bool:
     if kept is not None and kept.id == record.id and place is not None and not missing_files(place, job.promises):
         outcome = Outcome(kept.summary, kept.fault)
         if group is not None:
-            outcome = group.ended(job, record.id, outcome)
+            with acting_as(record.requested_by):
+                outcome = group.ended(job, record.id, outcome)
         state = JobState.SUCCEEDED if outcome.fault is None else JobState.FAILED
         store.finish(record.id, state, fault=outcome.fault, summary=outcome.summary)
         _note(record, "recovered")
@@ -75,11 +83,16 @@ def _went_on(manager: JobManager, record: JobRecord, job: Job) -> bool:
     return False
 
 
-def _settle_finished(manager: JobManager, record: JobRecord) -> None:
+def _require_files(manager: JobManager, record: JobRecord) -> None:
+    """Record a job that succeeded as failed where files of it are gone, or complete its deletion."""
     store, data = manager.store, manager.data
-    job = manager.kinds[record.kind].from_record(record)
+    try:
+        job = manager.kinds[record.kind].from_record(record)
+    except ValueError:
+        _log.warning("left by the last run", kind=str(record.kind), job=str(record.id), found="of another version")
+        return
     place = job.place(data, record.id)
-    if place is None or record.state is not JobState.SUCCEEDED:
+    if place is None:
         return
     missing = missing_files(place, job.promises)
     if not missing:
@@ -99,9 +112,9 @@ def _restore(manager: JobManager, kind: type[Job]) -> None:
     for place in kind.places(data):
         kept = None if place.is_symlink() else read_record(place)
         job_id = kept.id if kept is not None else _id_of(place)
-        if job_id in known:
+        if job_id in known and (kept is None or _belongs(manager, kept, place)):
             continue
-        if kept is not None and kept.kind is kind.kind and not missing_files(place, kind.promises):
+        if kept is not None and _belongs(manager, kept, place) and not missing_files(place, kind.promises):
             found.append((kept, place))
         else:
             data.put_aside(place)
@@ -110,6 +123,14 @@ def _restore(manager: JobManager, kind: type[Job]) -> None:
         with acting_as(kept.requested_by):
             store.restore(kept)
         _note(kept, "recovered")
+
+
+def _belongs(manager: JobManager, kept: JobRecord, place: Path) -> bool:
+    """Whether a record says that its files lie where it was found."""
+    try:
+        return manager.kinds[kept.kind].from_record(kept).place(manager.data, kept.id) == place
+    except (KeyError, ValueError):
+        return False
 
 
 def _id_of(place: Path) -> UUID | None:

@@ -62,6 +62,7 @@ class Tasks:
             TaskKind.ACCEPTANCE: AcceptanceTask(manager, acceptance),
         }
         self._lock = threading.Lock()
+        self._ended = False
         self._stops: dict[UUID, Stop] = {}
 
     def check(self, order: ScheduleSpec) -> None:
@@ -79,6 +80,8 @@ class Tasks:
         task, holder = self._of[order.task], holder_of(schedule, run)
         with self._lock:
             self._stops[schedule.id] = stop
+            if self._ended:
+                stop.ask()
         try:
             if self._manager.rig.facts is None:
                 # What it can do is known only when it is open.
@@ -91,6 +94,7 @@ class Tasks:
     def end(self) -> None:
         """Have every run end: the service ends."""
         with self._lock:
+            self._ended = True
             stops = list(self._stops.values())
         for stop in stops:
             stop.ask()

@@ -53,6 +53,7 @@ def test_a_service_says_what_its_catalogue_says_or_what_to_set(address: str, tmp
         assert (refused.status_code, "catalogue_login_file" in refused.json()["detail"]) == (404, True)
         assert client.get("/rig").json()["fleet"] is False
         assert "slrig_catalogue" not in client.get("/metrics").text
+    without.unpatch()
     served = ServedBench(tmp_path / "data", catalogue=address)
     assert served.service.copier is not None
     with client_of(served) as client:
@@ -65,6 +66,7 @@ def test_a_service_says_what_its_catalogue_says_or_what_to_set(address: str, tmp
         (here,), (there,) = found["rigs"], json.loads(told.output)["rigs"]
         assert here | {"seen_s": 0} == there | {"seen_s": 0}
         assert "slrig_catalogue_waiting 0.0" in client.get("/metrics").text
+    served.unpatch()
 
 
 def test_login_is_in_no_answer(postgres: Postgres, tmp_path: Path) -> None:

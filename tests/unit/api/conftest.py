@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -54,7 +54,7 @@ class ServedBench(TameBench):
         self.worker = TameCompute(PIPELINE) if worker is None else worker
         self.tame, self.combining = TameCalibrating(), TameCombining()
         patched = ExitStack()
-        functions = {
+        functions: dict[str, Callable[..., Any]] = {
             "combine.combining.combine_into": self.combining,
             # The fake reconstruction reports no residuals: each scan would log the traceback of a defect.
             "calibrate.verification.RigHealth._note_scan": lambda *_: None,

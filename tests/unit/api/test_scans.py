@@ -188,8 +188,11 @@ def test_cancel_may_be_repeated_and_delete_waits_for_the_end(client: TestClient,
 
 
 @pytest.mark.slow
-def test_old_scans_and_calibrations_are_removed_but_for_pinned_ones(tmp_path: Path) -> None:
+def test_old_scans_and_calibrations_are_removed_but_for_pinned_ones(
+    tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
     bench = ServedBench(tmp_path, keep_scans=1, keep_calibrations=1)
+    request.addfinalizer(bench.unpatch)
     calibrations = bench.service.calibrations
     old, new = (calibrations.open(BOARD).id for _ in range(2))
     removed, gone = threading.Event(), threading.Event()

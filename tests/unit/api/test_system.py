@@ -91,6 +91,7 @@ def test_probes_say_what_is_missing(client: TestClient, served: ServedBench, mon
 def test_service_whose_data_folder_is_gone_says_so(tmp_path: Path) -> None:
     # It is not started: nothing but requests uses its folder.
     idle = ServedBench(tmp_path / "data")
+    idle.unpatch()
     client = client_of(idle)
     root = idle.service.folder.root
     away = root.with_name("away")

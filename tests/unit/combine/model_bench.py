@@ -129,8 +129,7 @@ class ModelBench(Bench):
 
     def delete_scan(self, scan_id: UUID) -> None:
         """As the service does."""
-        with self.models.unused(scan_id):
-            self.manager.delete(scan_id)
+        self.manager.delete(scan_id, self.models.unused(scan_id))
 
     def kept_scans(self, *angles_deg: float | None) -> tuple[UUID, ...]:
         return tuple(kept_scan(self.store, self.folder, angle_deg=angle) for angle in angles_deg)

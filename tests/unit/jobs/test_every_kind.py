@@ -71,7 +71,7 @@ class Service(Bench):
             points.touch()
             return Reading(step.name, take, {}, 0.01, 0.01, 0.04, 900, 0, 0.0)
 
-        functions = {
+        functions: dict[str, Callable[..., Any]] = {
             "calibration.health.verification.verify_by_board": lambda *_: a_verification(),
             "combine.combining.combine_into": TameCombining(),
             "accept.running.evaluated": evaluate,

@@ -20,7 +20,7 @@ from slrig.jobs.compute import job_task
 from slrig.jobs.frame_feed import FrameSink
 from slrig.jobs.job import JobRun, Recording
 from slrig.jobs.worker_process import Task
-from slrig.model import Axis, Black, Calibration, CameraFormat, Capture, Frame, Gray, Shot, Size, White
+from slrig.model import Axis, Black, Calibration, CameraFormat, Capture, Frame, Gray, Pattern, Shot, Size, White
 from slrig.model.capture import CaptureHeader
 from slrig.scan.job import ScanJob
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
@@ -209,7 +209,9 @@ class TameBench:
         if self.error is not None:
             error, self.error = self.error, None
             raise error
-        patterns = (White(), Black(), *([Gray(Axis.COLUMN, 0, 6)] if plan.patterns.codes else []))
+        patterns: tuple[Pattern, ...] = (White(), Black())
+        if plan.patterns.codes:
+            patterns += (Gray(Axis.COLUMN, 0, 6),)
         image = np.zeros((48, 64), dtype=np.uint8)
         shots = tuple(Shot(index, "cam0", image) for index in range(len(patterns)))
         write_bundle(folder, Capture(OUTLINE.projector, patterns, OUTLINE.cameras, shots), rig.calibration)

@@ -206,7 +206,6 @@ def test_frames_take_as_many_bytes_as_they_have_samples(bit_depth: int, colour: 
         (ReconstructionPlan, "depth_edge_ratio", (1.0, 0.0, math.nan, math.inf), "a finite number above 1, found "),
         (ReconstructionPlan, "max_code_gap", (0,), "1 or more, found 0;"),
         (ReconstructionPlan, "drop_finest_bits", (-1,), "0 or more, found -1;"),
-        (ReconstructionPlan, "drop_finest_bits", (-1,), "0 or more, found -1;"),
         (ReconstructionPlan, "flip_rule", ("dyer",), "constrained or delaunay, found 'dyer';"),
         (ReconstructionPlan, "axis", ("diagonal",), "column or row, found 'diagonal'"),
         (ScanPlan, "exposure_s", (0.0, -0.1, math.nan, math.inf), "a finite time above 0 s, found "),
