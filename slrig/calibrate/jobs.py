@@ -174,7 +174,7 @@ class SolveJob(Job):
 
 
 def solve_name(session_id: UUID, number: int) -> str:
-    """What a solve is called in the calibration itself: the session's id, with its number from the second on.
+    """Name of a solve in the calibration file: the session's id, with its number from the second on.
 
     >>> solve_name(UUID(int=0), 2)
     '00000000-0000-0000-0000-000000000000.2'
@@ -200,25 +200,25 @@ def session_devices(record: SessionRecord, facts: RigFacts) -> tuple[Mapping[str
     return facts.sizes, facts.projector.size if record.patterns.codes else None
 
 
-# What the worker does at once
+# Short tasks of the worker
 
 
 def survey(session: Path) -> Mapping[str, Any]:
-    """What the accepted poses of a session cover, and what to move next, as JSON values."""
+    """Coverage by the accepted poses of a session, and where to hold the board next, as JSON values."""
     from slrig.calibrate.pose_judging import standing
 
     return asdict(standing(session_readings(session), setting_of(read_session(session))))
 
 
 def coverage_picture(session: Path, device: str, next_move: Mapping[str, Any]) -> bytes:
-    """A PNG of what a device has seen of the board, and where that goes next."""
+    """A PNG of the board positions that a device has seen, and of the next one."""
     from slrig.calibrate.pose_pictures import coverage_png
 
     return coverage_png(setting_of(read_session(session)), device, session_readings(session), next_move)
 
 
 def compare(first: Calibration, second: Calibration) -> Comparison:
-    """What the second calibration says otherwise than the first."""
+    """Differences of the second calibration from the first."""
     from slrig.calibration.accuracy import compare_calibrations
 
     return compare_calibrations(first, second)

@@ -36,8 +36,8 @@ class Recording(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a job found. summary : JSON values, as a list shows them. fault : why it failed although it came to its end,
-    as a pose that cannot be used; its files are kept. None where it succeeded.
+    """Result of a job. summary : JSON values for lists of jobs. fault : why it failed although it was computed whole,
+    such as a pose that cannot be used; its files are kept. None where it succeeded.
     """
 
     summary: Mapping[str, Any] | None = None
@@ -46,12 +46,12 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JobRun:
-    """What a job is given while it runs: with the rig, and then in the worker.
+    """Folder, callbacks and state of one running job: with the rig, then in the worker.
 
     folder : where its files are made; it is moved to `place` as a whole when the job has come to its end. place : None
     where nothing is kept. report : takes the stage, the fraction of this part that is done, and a detail for people.
     file_ready : takes the name of a file that can be fetched before the job is over. frames : takes the frames of a
-    capture while they come; None where nobody computes with them meanwhile. live : in the worker, what took them.
+    capture while they come; None where they are not computed meanwhile. live : in the worker, the scan that took them.
     evidence : what the frames proved as they were captured. where : where it is computed, for a report. pipeline : the
     module that the worker has prepared: `slrig.scan.reconstruct`.
     """
@@ -86,7 +86,7 @@ class JobRun:
 
     @property
     def result(self) -> Path:
-        """Where files are made that can be fetched at once: see `file_ready`. They belong beside the bundle."""
+        """Where files are made that can be fetched at once: see `file_ready`. They belong next to the bundle."""
         return self.folder / RESULT
 
 
@@ -113,8 +113,8 @@ class Job:
 
     @property
     def parent(self) -> UUID | None:
-        """What it belongs to: a series, a calibration, an acceptance test, a model; None where it stands alone. A field
-        `group` says it, and is no part of the plan.
+        """Id of the series, calibration, acceptance test or model that the job belongs to; None without one. It is
+        the field `group`, which the plan leaves out.
         """
         group: UUID | None = getattr(self, "group", None)
         return group
@@ -131,7 +131,7 @@ class Job:
 
     @property
     def region(self) -> Region | None:
-        """What of the scene the worker computes while frames come; None for all."""
+        """Part of the scene that the worker computes while frames come; None for all."""
         return None
 
     @property
@@ -174,8 +174,8 @@ class Job:
 
 
 class Group(Protocol):
-    """What jobs of a kind belong to, and what is learnt from them: a calibration, an acceptance test, a model, the
-    health of the rig. It is told before others can see that a job is further, on whatever thread.
+    """Document that jobs of a kind change: a calibration, an acceptance test, a model, the health of the rig. It is
+    called before others can see that a job went on, on any of its threads.
     """
 
     def captured(self, job: Job, job_id: UUID) -> None:

@@ -1,4 +1,4 @@
-"""The one that runs jobs: one after the other with the rig, beside it what computes, each put on record with one end.
+"""Runs jobs: one at a time with the rig, others compute meanwhile; each job is on record with one end.
 
 A job whose light is over leaves the rig to the next one. Pictures for those who aim come in between.
 """
@@ -45,7 +45,7 @@ from slrig.rig.session import ActiveCalibration, RigFacts, RigSession, driver_er
 from slrig.rig.watchdog import Call, Watchdog
 
 RETRY_S = 2.0
-"""How long after the disk refused the end of a job it is tried again: soon enough for whoever waits for that."""
+"""Seconds until an end of a job that the disk refused to record is recorded again: clients may wait for it."""
 
 _LOOK_S = 0.1
 """How often a drain looks whether it is over, or to be cut short."""
@@ -179,11 +179,11 @@ class JobManager:
         self._owner = threading.Thread(target=self._own_rig, name="slrig-rig", daemon=True)
         self._watchdog = Watchdog(rig.calls, self._give_up_on)
 
-    # What others ask for
+    # Requests
 
     def start(self) -> None:
         """Open the rig, on its own thread, and have the worker load its kernels."""
-        # With the lock held, so that the owner has what it captures computed itself, and nobody twice.
+        # With the lock held, so that a job that the owner captures meanwhile is computed once.
         with self._changed:
             self._owner.start()
             for work in self._computing:
@@ -209,7 +209,7 @@ class JobManager:
         Raises
         ------
         SlrigError
-            What `Job.check` raises.
+            As `Job.check` raises.
         StorageError
             There is too little room, or the disk refused.
         RigBusyError
@@ -263,7 +263,7 @@ class JobManager:
         return self.store.create_all(plans, kind=kind, rig=rig, label=label, parent=group, key=key, job_id=job_id)
 
     def add(self, *jobs: Job, label: str | None = None, holder: Holder | None = None) -> list[JobRecord]:
-        """Put jobs on record and have them done, however many wait: nobody is there to hear a refusal."""
+        """Put jobs on record and line them up, however many wait: no client could be refused."""
         with self._changed:
             records = self.record(*jobs, label=label)
             self._line_up([self._work(job, record, holder) for job, record in zip(jobs, records, strict=True)])
@@ -290,7 +290,7 @@ class JobManager:
         elif not under_way:
             self.settle()
             if all(end.id != job_id for end in self._ends):
-                # Nobody works on it, and nobody knows how it ended.
+                # No thread works on it, and its end is unknown.
                 fault = job_failure(ScanInterruptedError("Nothing works on this any more. Start it again."))
                 self.store.finish(job_id, JobState.INTERRUPTED, fault=fault)
         return self.store.get(job_id)
@@ -313,12 +313,12 @@ class JobManager:
             unwatch()
         return self.store.get(job_id)
 
-    def delete(self, job_id: UUID, unused: AbstractContextManager[None] | None = None) -> None:
+    def delete(self, job_id: UUID, unused: AbstractContextManager[object] | None = None) -> None:
         """Remove a job that is over: its record, its events, its files. Raises JobNotFoundError, ScanStateError.
 
         unused : entered meanwhile; it raises where something else needs the job.
         """
-        # Before `unused`: whoever hears of an end may want the locks that it holds.
+        # Before `unused`: listeners to an end may take the locks that it holds.
         self.settle()
         record = self.store.get(job_id)
         if not record.state.final:
@@ -402,7 +402,7 @@ class JobManager:
     def drain(self, timeout_s: float, hurry: threading.Event) -> None:
         """Begin no further job, and wait until those under way are over, for so long, or until `hurry`.
 
-        What waits stays on record as it is: the next start of the service goes on with it. `close` has to follow.
+        Waiting jobs stay on record: the next start of the service goes on with them. Call `close` afterwards.
         """
         give_up = time.monotonic() + timeout_s
         with self._changed:
@@ -421,7 +421,7 @@ class JobManager:
                 return
             self._closed = True
             self._stop()
-            # What computes waits for it.
+            # A computing job waits for it.
             self.worker.close()
             self._join(timeout_s)
             with self._changed:
@@ -497,7 +497,7 @@ class JobManager:
         while (work := self._next()) is not None:
             try:
                 self._run(work)
-            except Exception:  # noqa: BLE001 - the owner thread outlives whatever happens to one job
+            except Exception:  # noqa: BLE001 - the owner thread goes on after any failure of one job
                 _log.exception("the end of work with the rig went wrong", work=work.holder.words)
         self.rig.darken()
         self.rig.let_go()
@@ -518,7 +518,7 @@ class JobManager:
 
     def _run(self, work: _Work) -> None:
         """The first part of a job, and what comes to be of it."""
-        # What is no Exception, and ends the thread, is no success either.
+        # An error that ends the thread is not a success.
         error: Exception | None = RuntimeError("the thread that owns the rig was ended")
         goes_on = False
         try:
@@ -526,7 +526,7 @@ class JobManager:
                 with structlog.contextvars.bound_contextvars(job=str(work.id)):
                     self._capture(work)
                 error = None
-            except Exception as raised:  # noqa: BLE001 - the owner thread outlives whatever happens to one job
+            except Exception as raised:  # noqa: BLE001 - the owner thread goes on after any failure of one job
                 error = interruption_error() if self._ending else raised
             finally:
                 self.rig.darken()
@@ -562,7 +562,7 @@ class JobManager:
         try:
             with driver_errors(rig.name):
                 rig.open()
-                # What the rig can do may not have been known before, and its calibration may have changed.
+                # Before, the rig may not have been open, or may have had another calibration.
                 self.require_space(job.check(rig))
                 if job.feeds:
                     work.feed = self.worker.feed(job.region)
@@ -593,7 +593,7 @@ class JobManager:
             rig = self.rig.open()
             with driver_errors(self.rig.name):
                 self._previews.run(rig, stop=self._wanted)
-        except Exception as error:  # noqa: BLE001 - the owner thread outlives whatever happens to a picture
+        except Exception as error:  # noqa: BLE001 - the owner thread goes on after any failure of a preview
             self.rig.let_go(error)
             self._log_unopened(error)
             fault = job_failure(error)
@@ -606,7 +606,7 @@ class JobManager:
         elif error is not None:
             _log.error("the rig's driver failed with an error of its own", rig=self.rig.name, exc_info=error)
 
-    # What computes
+    # Computing
 
     def _begin_computing(self, work: _Work) -> None:
         # A daemon, so that it never holds up the end of the service.
@@ -707,7 +707,7 @@ class JobManager:
                 group.captured(work.job, work.id)
 
     def _on_record_as_computing(self, work: _Work) -> bool:
-        """Record that all is there to compute with, whatever ends the service; return whether that could be done."""
+        """Record that all frames are there, so that a restart computes with them; return whether that worked."""
         try:
             self.store.advance(work.id, JobState.COMPUTING)
         except StorageError as error:
@@ -785,7 +785,7 @@ class JobManager:
         self.settle()
 
     def settle(self) -> None:
-        """Record the ends that are not on record yet. What the disk refuses is tried again after a while."""
+        """Record the ends that are not on record yet. Ends that the disk refuses are tried again later."""
         with self._changed:
             ends = list(self._ends)
         for end in ends:
@@ -793,7 +793,7 @@ class JobManager:
                 made = self.store.finish(end.id, end.state, fault=end.outcome.fault, summary=end.outcome.summary)
             except JobNotFoundError:
                 made = False
-            except Exception as error:  # noqa: BLE001 - whatever refuses the record, the end is not lost
+            except Exception as error:  # noqa: BLE001 - the end is not lost, whichever error refuses it
                 _log.error(
                     "the end of a job could not be recorded",
                     job=str(end.id), state=str(end.state), exc_info=not isinstance(error, StorageError),
@@ -892,7 +892,7 @@ def _end_by(error: Exception, job_id: UUID, *, hidden: str) -> _End:
 
 @contextmanager
 def _unharmed(work: _Work) -> Iterator[None]:
-    """What happens within the block must not change how the job itself ends."""
+    """Log an error of the block: it does not change how the job ends."""
     try:
         yield
     except Exception:  # noqa: BLE001 - see above

@@ -1,4 +1,4 @@
-"""What the service does first: bring records and files together again after whatever ended the last run."""
+"""The first step of a start: make records and files of the last run agree, however it ended."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def resume(manager: JobManager) -> None:
     - Any other was interrupted; its frames are kept if it keeps them and all had come.
     - A deletion that was cut off is completed.
     - A job that succeeded and lacks files is recorded as failed.
-    - Files of a finished job without a record, as beside a database that was lost, are on record again, as they say
+    - Files of a finished job without a record, as after a lost database, are on record again, as they say
       themselves; other files without a record are put aside in `.orphans`.
     """
     store, data = manager.store, manager.data
@@ -34,7 +34,7 @@ def resume(manager: JobManager) -> None:
     for record in store.unfinished():
         try:
             job = manager.kinds[record.kind].from_record(record)
-            # What is not ready is gone on with by its group.
+            # A job that is not ready is continued by its group.
             goes_on = not job.ready or _went_on(manager, record, job)
         except Exception:  # noqa: BLE001 - the others, and the service, go on all the same
             _log.exception("a job could not be gone on with", job=str(record.id))
@@ -68,7 +68,7 @@ def _went_on(manager: JobManager, record: JobRecord, job: Job) -> bool:
         return False
     whole = not job.uses_rig or data.owns(data.staging(record.id) / BUNDLE)
     captured = record.state is JobState.COMPUTING and whole
-    # What uses no rig has waited, also while its views were shot.
+    # A job without the rig has waited, also while its views were captured.
     waited = record.state is JobState.QUEUED or (not job.uses_rig and not captured)
     if waited or (captured and store.attempts(record.id) == 1):
         manager.begin(job, record, captured=captured)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import time
 from collections.abc import Callable
@@ -349,9 +350,9 @@ def test_light_is_given_in_the_wanted_channels_and_within_the_measured_area() ->
     end, middle_row = PROJECTOR.width_px - 1.0, (PROJECTOR.height_px - 1) / 2
     places = np.array([[end / 2, middle_row], [end, 0.0], [2 * end, middle_row]])
     whole = light_map(1.0, 2.0, 0.6).light(places, PROJECTOR, 3)
-    np.testing.assert_allclose(whole, np.outer([1, np.e, np.e], [1.0, 2.0, 0.6]))
+    np.testing.assert_allclose(whole, np.outer([1, math.e, math.e], [1.0, 2.0, 0.6]))
     np.testing.assert_allclose(
-        light_map(1.0, 2.0, 0.6).light(places, PROJECTOR, 1), [[1.2], [1.2 * np.e], [1.2 * np.e]]
+        light_map(1.0, 2.0, 0.6).light(places, PROJECTOR, 1), [[1.2], [1.2 * math.e], [1.2 * math.e]]
     )
     assert light_map(1.5).light(places, PROJECTOR, 3).shape == (3, 1)
 

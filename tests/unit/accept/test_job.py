@@ -13,7 +13,8 @@ import pytest
 
 from slrig.accept import running as acceptance
 from slrig.accept.asking import AcceptanceRequest
-from slrig.accept.job import AcceptanceTests
+from slrig.accept.evaluation import Reading
+from slrig.accept.job import AcceptanceTests, PositionJob
 from slrig.accept.plan import AcceptancePlan, usual_limits
 from slrig.accept.records import AcceptanceState, record_from_json, record_json
 from slrig.calibration.artefacts import Decision
@@ -34,7 +35,8 @@ from slrig.errors import (
 from slrig.failure import interruption_error, job_failure
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
-from slrig.jobs.records import JobRecord
+from slrig.jobs.job import Outcome
+from slrig.jobs.records import JobRecord, JobState
 from slrig.jobs.resume import resume
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration
@@ -162,6 +164,41 @@ def test_a_cancelled_test_is_over(desk: Desk) -> None:
         desk.measure(running.id, wait=False, scripted=True)
     with pytest.raises(ArtefactNotReadyError, match="is cancelled"):
         desk.file(running.id, "report.json")
+
+
+def test_script_that_is_cancelled_while_a_position_is_measured_ends_with_it(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    test = desk.open(the_plan)
+    evaluated = acceptance.evaluated
+
+    def cancelled_meanwhile(*given: Any, **options: Any) -> Reading:
+        desk.cancel(test.id)
+        return evaluated(*given, **options)
+
+    monkeypatch.setattr(acceptance, "evaluated", cancelled_meanwhile)
+    desk.measure(test.id, wait=False, scripted=True)
+    assert desk.get(test.id).state is AcceptanceState.CANCELLED
+    assert [(each.step, each.take) for each in desk.get(test.id).readings] == [("sphere-1", 0), ("sphere-1", 1)]
+    assert moves(desk) == [0]
+
+
+def test_next_position_is_put_on_record_once(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    test = desk.open(the_plan)
+    evaluated = acceptance.evaluated
+
+    def killed_afterwards(*given: Any, **options: Any) -> Reading:
+        desk.manager.lazy = True
+        return evaluated(*given, **options)
+
+    monkeypatch.setattr(acceptance, "evaluated", killed_afterwards)
+    AcceptanceTests.measure(desk, test.id, wait=False, scripted=True)
+    store = desk.manager.store
+    wait_for(store, test.id, lambda: [job.state for job in store.of(test.id)] == [JobState.SUCCEEDED, JobState.QUEUED])
+    first = store.of(test.id)[0]
+    # As at the next start, where the end of the first was not on record.
+    desk.ended(PositionJob.from_record(first), first.id, Outcome())
+    assert [job.plan["step"] for job in store.of(test.id)] == ["sphere-1", "sphere-2"]
 
 
 def test_what_cannot_be_tested_is_refused(desk: Desk) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -510,3 +511,48 @@ def test_an_end_that_the_disk_refuses_is_recorded_later(tame: JobBench, monkeypa
     with capture_logs():
         assert tame.done(Steps()).state is JobState.SUCCEEDED
     assert refused.is_set()
+
+
+@pytest.mark.parametrize("state", [JobState.COMPUTING, JobState.SUCCEEDED])
+def test_record_of_another_version_does_not_keep_the_service_from_starting(tame: JobBench, state: JobState) -> None:
+    other, whole = tame.done(Steps()), tame.done(Steps())
+    with tame.store.database.changing() as session:
+        session.connection().exec_driver_sql(
+            "UPDATE job SET state = ?, plan = '{\"unheard\": 1}' WHERE id = ?", (state, str(other.id))
+        )
+    with capture_logs():
+        resume(tame.started())
+    ended = {JobState.COMPUTING: JobState.INTERRUPTED, JobState.SUCCEEDED: JobState.SUCCEEDED}
+    assert tame.store.get(other.id).state is ended[state]
+    assert tame.store.get(whole.id) == whole
+
+
+def test_copy_of_a_job_is_put_aside_and_the_job_stays(
+    tame: JobBench, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(SteppedJob, "places", classmethod(lambda _, data: (data.root / "scans").iterdir()))
+    job = tame.done(Steps())
+    place = tame.folder.scan(job.id)
+    shutil.copytree(place, place.with_name(f"{job.id}-copy"))
+    with capture_logs():
+        resume(tame.started())
+    assert [path.name for path in place.parent.iterdir()] == [str(job.id)]
+    assert tame.store.get(job.id) == job
+    assert any(f"{job.id}-copy" in path.name for path in (tmp_path / "data" / ".orphans").iterdir())
+
+
+def test_deletion_holds_no_lock_while_ends_are_recorded(tame: JobBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    job, needed, free = tame.done(Steps()), threading.RLock(), list[bool]()
+
+    def listen() -> None:
+        free.append(needed.acquire(blocking=False))
+        needed.release()
+
+    def settle() -> None:
+        listener = threading.Thread(target=listen)
+        listener.start()
+        listener.join()
+
+    monkeypatch.setattr(tame.manager, "settle", settle)
+    tame.manager.delete(job.id, needed)
+    assert free == [True]
