@@ -146,7 +146,8 @@ class Host(WorkerPlugin):
 
             try:
                 answer = self._worker.run(task, progress=progress, cancelled=stopped, made=made)
-                for path in result.iterdir():
+                # A task that makes no file makes no folder.
+                for path in result.glob("*"):
                     if path.name not in sent:
                         made(path.name)
                 return PoolResponse(answer, {name: sent[name].result() for name in sorted(sent)})

@@ -46,6 +46,7 @@ from slrig.errors import (
     StorageError,
     WorkerLostError,
 )
+from slrig.jobs.data_folder import RESULT
 from slrig.jobs.frame_feed import FrameFeed
 from slrig.jobs.job import JobRun
 from slrig.jobs.versions import versions
@@ -599,10 +600,13 @@ def test_a_file_travels_while_the_next_one_is_made(pool: Pool, tmp_path: Path, m
     def run(task: Task, *, made: Callable[[str], None] = lambda _: None, **_: object) -> object:
         if not task.movable:
             return versions()
-        (task.given[1] / "mesh.ply").write_bytes(b"ply")
+        assert task.files is not None
+        result = task.files.folder / RESULT
+        result.mkdir()
+        (result / "mesh.ply").write_bytes(b"ply")
         made("mesh.ply")
         assert gone.wait(30)
-        (task.given[1] / "report.json").write_bytes(b"{}")
+        (result / "report.json").write_bytes(b"{}")
         return "the report"
 
     monkeypatch.setattr(pool.store, "put_result", put_result)
