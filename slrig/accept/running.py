@@ -37,9 +37,6 @@ Place = Callable[[Rig, Step], None]
 """Brings the artefact of a step to its place, before each capture but those that repeat one without a move; returns
 when it stands there and is still."""
 
-Evaluate = Callable[..., Reading]
-"""`evaluated`, or a way to have it done elsewhere."""
-
 
 def bundle_name(step: Step, take: int) -> str:
     """The folder of a capture's frames."""
@@ -51,8 +48,8 @@ def capture_take(
 ) -> None:
     """Record a bundle of the artefact that stands before the rig. Raises CalibrationError, and as a scan."""
     calibration = required_calibration(rig)
-    # The test must not use what a rendered rig knows of its scene; and the noise of a point, which is told beside its
-    # form, is to hold nothing of the calibration's own error, which is what form is to show.
+    # The test must not use what a rendered rig knows of its scene; and the noise of a point, stated next to its form,
+    # leaves out the calibration's own error, which the form shows.
     blind = replace(rig, head=None, calibration=replace(calibration, solved=None))
     scan = ScanPlan(exposure_s=plan.exposure_s)
     capture_frames(blind, scan, bundle, progress=progress, cancelled=cancelled).finish()
@@ -92,15 +89,17 @@ def run_acceptance(
     cancelled: Callable[[], bool],
     place: Place | None = None,
     again: Callable[[Step, SlrigError], bool] | None = None,
-    evaluate: Evaluate = evaluated,
 ) -> AcceptanceResult:
     """Measure every position of a plan, evaluate, and write report.html, report.json and the points into `folder`.
 
     `place` None has the rig's positioner move the artefacts: its poses are called as the steps are. The points of each
-    capture stay in `folder`/points, as they come; the reports appear at the end.
+    capture stay in `folder`/positions, as they come; the reports appear at the end. `again` is asked where an artefact
+    was not found or a frame contradicted its pattern: whether to place it anew and capture once more.
 
-    Raises as `measured`; InvalidInputError if `folder` holds something else; UnsupportedByDeviceError if `place` is
-    None, and the rig has no positioner, or one that does not know a position.
+    Raises CalibrationError if the rig has no calibration; InvalidInputError if `folder` holds something else;
+    UnsupportedByDeviceError if `place` is None, and the rig has no positioner, or one that does not know a position;
+    NothingToReconstructError if an artefact is not where it should be, and what was measured before is kept;
+    ScanCancelledError; DeviceError, ScanEvidenceError, StorageError as a scan.
     """
     # Late: the service measures position by position, and has the worker write the reports.
     from slrig.accept.report import write_reports
@@ -109,40 +108,26 @@ def run_acceptance(
     mover = by_positioner(rig, plan) if place is None else place
     _require_free(folder)
     begun = utc_now()
-    readings = tuple(
-        measured(
-            rig, plan, 0, folder, progress=progress, cancelled=cancelled, place=mover, again=again, evaluate=evaluate
-        )
-    )
+    readings = tuple(_measured(rig, plan, folder, progress, cancelled, mover, again))
     result = AcceptanceResult(rig.name, begun, utc_now(), plan, calibration, readings, verdicts(readings, plan))
     write_reports(result, folder)
     return result
 
 
-def measured(
+def _measured(
     rig: Rig,
     plan: AcceptancePlan,
-    done: int,
     folder: Path,
-    *,
     progress: ProgressCallback,
     cancelled: Callable[[], bool],
-    place: Place | None,
-    again: Callable[[Step, SlrigError], bool] | None = None,
-    evaluate: Evaluate = evaluated,
+    place: Place,
+    again: Callable[[Step, SlrigError], bool] | None,
 ) -> Iterator[Reading]:
-    """Capture and evaluate what is left of a plan, one capture after the other, and keep its points in `folder`.
-
-    done : how many captures of the plan were made before. `place` None: the artefact stands in its place. `again` is
-    asked where an artefact was not found or a frame contradicted its pattern: whether to place it anew and capture once
-    more; a repeat is captured without a move, so that it shows the scanner's scatter alone.
-
-    Raises CalibrationError if the rig has no calibration; NothingToReconstructError if an artefact is not where it
-    should be, and what was measured before is kept; ScanCancelledError; DeviceError, ScanEvidenceError, StorageError as
-    a scan.
+    """Capture and evaluate each step, one capture after the other, and keep its points in `folder`. A repeat is
+    captured without a move, so that it shows the scanner's scatter alone.
     """
     takes = plan.takes
-    for index, (step, take) in enumerate(takes[done:], done):
+    for index, (step, take) in enumerate(takes):
 
         def told(stage: str, fraction: float, detail: str, /, name: str = step.name, index: int = index) -> None:
             progress(f"{name}: {stage}", (index + min(max(fraction, 0.0), 1.0)) / len(takes), detail)
@@ -151,11 +136,11 @@ def measured(
             message = f"the acceptance test was cancelled before {step.name}; what was measured before is kept"
             raise ScanCancelledError(message)
         while True:
-            if place is not None and take == 0:
+            if take == 0:
                 told("place", 0.0, step.words)
                 place(rig, step)
             try:
-                found = _captured(rig, plan, step, take, folder, told, cancelled, evaluate)
+                found = _captured(rig, plan, step, take, folder, told, cancelled)
                 break
             except (NothingToReconstructError, ScanEvidenceError) as error:
                 if again is None or not again(step, error):
@@ -171,7 +156,6 @@ def _captured(
     folder: Path,
     progress: ProgressCallback,
     cancelled: Callable[[], bool],
-    evaluate: Evaluate,
 ) -> Reading:
     work = folder / f".{step.name}-{take + 1}"
     shutil.rmtree(work, ignore_errors=True)
@@ -180,7 +164,7 @@ def _captured(
             work.mkdir(parents=True)
         bundle = work / bundle_name(step, take)
         capture_take(rig, plan, bundle, progress=progress, cancelled=cancelled)
-        return evaluate(bundle, folder, plan, step, take, progress=progress, cancelled=cancelled)
+        return evaluated(bundle, folder, plan, step, take, progress=progress, cancelled=cancelled)
     finally:
         shutil.rmtree(work, ignore_errors=True)
 

@@ -201,7 +201,7 @@ class Calibrations:
                 )
                 self.register.change(session_id, must_last=False, **guidance)
         except Exception:  # noqa: BLE001 - coverage and advice are a help, and nothing fails for want of them
-            _log.exception("coverage could not be told", calibration=str(session_id))
+            _log.exception("coverage could not be computed", calibration=str(session_id))
 
     # The solve
 

@@ -28,7 +28,7 @@ class SessionGuidance:
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """What is told of a pose. refusals : why it cannot be used, in words; none if it can. answer : its figures, as JSON
+    """Judgement of a pose. refusals : why it cannot be used, in words; none if it can. answer : its figures, as JSON
     values. standing : where the session stands with it, None where it could not be read.
     """
 

@@ -213,7 +213,7 @@ class HealthStore:
     def added(self, session: Session, before: VerificationRecord | None, now: VerificationRecord) -> None:
         """Called in the transaction that puts a verification on record. before : the one before it, of any calibration.
 
-        For those who tell of it.
+        A subclass that sends notices overrides it.
         """
 
     def history(self, *, limit: int = 200, since: datetime | None = None) -> Sequence[VerificationRecord]:
@@ -292,7 +292,7 @@ class RigHealth:
         if job.kind is JobKind.SCAN:
             try:
                 self._note_scan(job_id, json.loads((self._data.scan(job_id) / REPORT).read_bytes()))
-            except Exception:  # noqa: BLE001 - the scan stands, whatever becomes of that
+            except Exception:  # noqa: BLE001 - an error here must not fail the scan
                 _log.exception("what a scan says of its calibration could not be noted")
             return outcome
         found, calibration = verification_from_document(outcome.summary["found"]), outcome.summary["calibration"]

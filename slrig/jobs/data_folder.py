@@ -199,8 +199,8 @@ class DataFolder:
         return self.staging(scan_id) / RESULT
 
     def places(self, scan_id: UUID) -> tuple[Path, Path, Path]:
-        """Where a file of a scan that is being reconstructed may lie. `put` moves it from one to the next: whoever
-        looks in this order finds it.
+        """Folders where a file of a scan that is being reconstructed may lie. `put` moves it from one to the next:
+        a search in this order finds it.
         """
         return self.result(scan_id), self.staging(scan_id), self.scan(scan_id)
 

@@ -156,11 +156,13 @@ class Job:
         return 0
 
     def capture(self, rig: RigSession, run: JobRun) -> Recording | None:
-        """Use the rig, on its thread. What is returned is on its way to `run.recording`; None where nothing is."""
+        """Use the rig, on its thread; for kinds with `uses_rig`. Return the recording that is still being written to
+        `run.recording`; None without one.
+        """
         raise NotImplementedError
 
     def compute(self, run: JobRun) -> Outcome:
-        """Do the mathematics, in the worker, in `run.folder`."""
+        """Do the mathematics, in the worker, in `run.folder`; for kinds with `computes`."""
         raise NotImplementedError
 
     def place(self, data: DataFolder, job_id: UUID) -> Path | None:  # noqa: ARG002 - for those that keep files

@@ -200,7 +200,7 @@ class JobManager:
         holder: Holder | None = None,
         first: Callable[[], object] = lambda: None,
     ) -> list[JobRecord]:
-        """Put jobs of one kind on record, all or none, and have them done in their order. Returns at once.
+        """Put jobs of one kind on record, all or none, and line them up in their order. Returns at once.
 
         wait : the first may stand behind other jobs. key : the idempotency key of the request, reserved. holder : whom
         a refusal names meanwhile; None the job. first : called once a place in the line is certain, before anything is

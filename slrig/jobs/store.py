@@ -44,7 +44,7 @@ EVERY_JOB = UUID(int=0)
 class JobStore:
     """The jobs of all kinds. Any thread of the one process that owns it may call.
 
-    outbox : where notices of their ends are put; without one nobody is told. kinds, of any method : which are meant;
+    outbox : where notices of their ends are put; without one no notice is sent. kinds, of any method : which are meant;
     all where none is named.
     """
 

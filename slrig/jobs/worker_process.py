@@ -165,8 +165,8 @@ def serve(
     """The child's life: prepare, then do jobs until the parent's end of the pipe is gone.
 
     stops : brings the numbers of jobs that are not wanted any more, past whatever waits in the pipe. heartbeat : takes
-    the time of the last sign of life, `time.monotonic`. module : offers `warm_kernels(told)`, `frame_receiver()`,
-    what the frames of a capture are told to, and what jobs find as `JobRun.pipeline`. logs : how the parent logs.
+    the time of the last sign of life, `time.monotonic`. module : offers `warm_kernels(told)`, and `frame_receiver()`
+    for the frames of a capture; jobs find it as `JobRun.pipeline`. logs : how the parent logs.
     """
     if logs is not None:
         set_up_logs(logs.level, logs.form)

@@ -70,8 +70,8 @@ class RigSession:
     """A rig and the one thread that may touch it: all but `calls`, `facts`, `settings`, `fault`, `active`, `health`,
     `calibration`, `misfit`, `refuse_misfit`, `use_calibration`, `give_up` and `darken_from_outside` belong to it.
 
-    `active` gives whatever is begun from then on that calibration in place of the rig's own. One that is
-    for other devices leaves the rig without any: the rig can still be calibrated, and a scan is refused.
+    `active` replaces the rig's own calibration for all that begins afterwards. One that is for other
+    devices leaves the rig without any: the rig can still be calibrated, and a scan is refused.
 
     table_at : the file that keeps where a turntable stands, so that its angles go on from one opening to the next.
     """
@@ -146,7 +146,7 @@ class RigSession:
         CalibrationError
             It is for other devices than those of the open rig.
         """
-        # Before the rig is open nobody knows; a scan is then refused with the same words.
+        # Before the rig is open its devices are unknown; a scan is then refused with the same words.
         fault = None if active is None else self.misfit(active)
         if fault is not None:
             raise fault

@@ -1,4 +1,4 @@
-"""The real manager without its thread of the rig: whoever submits a job does its first part."""
+"""The real manager without its thread of the rig: the thread that submits a job does its first part."""
 
 from __future__ import annotations
 
