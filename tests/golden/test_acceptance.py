@@ -13,6 +13,7 @@ from slrig.accept.plan import AcceptancePlan, Quantity, exact_artefacts
 from slrig.accept.positions import acceptance_plan, rig_volume_mm
 from slrig.accept.running import run_acceptance
 from slrig.accept.scene import scripted_config
+from slrig.accept.store import points_file
 from slrig.accept.verdicts import AcceptanceResult
 from slrig.calibration.artefacts import Decision, fit_sphere
 from slrig.config import read_rig
@@ -89,7 +90,7 @@ def test_the_whole_test_of_a_rendered_rig_reports_the_errors_that_there_are(tmp_
     forms = []
     for each in result.readings:
         assert each.rejected_share <= 0.003
-        kept = np.load(tmp_path / "out" / "points" / f"{each.step}-1.npz")
+        kept = np.load(tmp_path / "out" / points_file(each.step, each.take))
         points = kept["points_mm"].astype(np.float64)
         step = next(step for step in plan.steps if step.name == each.step)
         if Quantity.FORM in each.errors_mm:
