@@ -8,7 +8,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from slrig.errors import OutOfMemoryError, ScanInterruptedError, SlrigError, StorageError
+from slrig.errors import (
+    DeviceError,
+    LibraryMissingError,
+    OutOfMemoryError,
+    RigBusyError,
+    ScanInterruptedError,
+    SlrigError,
+    StorageError,
+)
 
 UNEXPECTED = "unexpected"
 """The code of a failure that is a defect of slrig: its message is for people, its cause is in the service's log."""
@@ -37,6 +45,17 @@ def errors_by_code() -> dict[str, type[SlrigError]]:
             classes[error.code] = error
         waiting.extend(error.__subclasses__())
     return classes
+
+
+def error_of(fault: JobFailure) -> SlrigError:
+    """The error that a recorded fault stands for.
+
+    >>> error_of(JobFailure("pose-refused", "no camera sees the board"))
+    PoseRefusedError('no camera sees the board')
+    """
+    kind = errors_by_code().get(fault.code, SlrigError)
+    # These two take more than a message.
+    return DeviceError(fault.message) if kind in {RigBusyError, LibraryMissingError} else kind(fault.message)
 
 
 def job_failure(error: BaseException) -> JobFailure:

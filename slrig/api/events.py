@@ -23,6 +23,7 @@ from slrig.calibrate.register import CalibrationRegister
 from slrig.config import ServiceSettings
 from slrig.errors import CalibrationNotFoundError, JobNotFoundError
 from slrig.failure import JobFailure
+from slrig.jobs.examinations import EXAMINATIONS
 from slrig.jobs.records import JobEvent, JobKind, JobState
 from slrig.jobs.store import EVERY_JOB, JobStore
 
@@ -207,6 +208,14 @@ async def follow_verification(
     return await _follow_job(place, service, JobKind.VERIFICATION, verification_id, last_event_id)
 
 
+@router.get("/rig/job/{job_id}/events", tags=["rig"], response_class=Response, responses=_JOB)
+async def follow_rig_job(
+    place: StreamPlace, service: Serving, job_id: UUID, last_event_id: LastEventId = 0
+) -> Response:
+    """Follow an examination of the rig until it is over. Events that happened before come first."""
+    return await _follow_job(place, service, None, job_id, last_event_id)
+
+
 @router.get("/model/{model_id}/events", tags=["model"], response_class=Response, responses=_JOB)
 async def follow_model(
     place: StreamPlace, service: Serving, model_id: UUID, last_event_id: LastEventId = 0
@@ -250,9 +259,9 @@ async def follow_everything(
     return _opened(place, service.settings, EVERY_JOB, followed, now, begins=now)
 
 
-async def _follow_job(place: Place, service: Serving, kind: JobKind, job_id: UUID, after: int) -> Response:
+async def _follow_job(place: Place, service: Serving, kind: JobKind | None, job_id: UUID, after: int) -> Response:
     # One that is on no record is refused here; one that is deleted later only ends its stream.
-    await run_in_threadpool(service.store.get, job_id, kind)
+    await run_in_threadpool(service.store.get, job_id, *(EXAMINATIONS if kind is None else (kind,)))
     return await _stream(place, service.settings, job_id, followed_job(service.store, job_id), after)
 
 

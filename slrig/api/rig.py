@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import AsyncIterator
 from datetime import datetime
 from typing import Annotated, Any
@@ -13,7 +12,7 @@ import numpy as np
 from fastapi import APIRouter, Path, Query, Response
 from fastapi.concurrency import run_in_threadpool
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
 from starlette.responses import StreamingResponse
 
 from slrig.api.events import StreamPlace
@@ -23,7 +22,6 @@ from slrig.api.service import Serving
 from slrig.devices import CameraInfo, FoundDevice
 from slrig.discovery import InstalledDriver, MissingLibrary, OtherSystem, discover_devices, installed_drivers
 from slrig.errors import SlrigError
-from slrig.jobs.examinations import Examination, last_examination
 from slrig.jobs.manager import RigStatus
 from slrig.jobs.records import utc_now
 from slrig.rig.preview import Light, Watch
@@ -88,25 +86,6 @@ def list_devices() -> DeviceList:
     """Return the drivers that are installed, the devices that are plugged in, and the libraries that are missing."""
     found = discover_devices()
     return filled(DeviceList, found, drivers=installed_drivers(), faults=[str(fault) for fault in found.faults])
-
-
-class Examinations(BaseModel):
-    """What `slrig doctor` and `slrig conform` found last; null where they did not run with this data folder."""
-
-    doctor: Examination | None
-    conform: Examination | None
-    commands: dict[str, str] = Field(description="what to run, with the rig file of this service")
-
-
-@router.get("/rig/examinations")
-def list_examinations(service: Serving) -> Examinations:
-    """Return what `slrig doctor` and `slrig conform` found last on this rig. Touches no device."""
-    root, rig = service.folder.root, service.manager.rig.name
-    return Examinations(
-        doctor=last_examination(root, "doctor", rig),
-        conform=last_examination(root, "conform", rig),
-        commands={name: f"slrig {name} RIG.toml --data {shlex.quote(str(root))}" for name in ("doctor", "conform")},
-    )
 
 
 def _in_use(status: RigStatus) -> CalibrationInUse | None:

@@ -30,7 +30,9 @@ from slrig.calibrate.verification import VerificationJob
 from slrig.combine.job import TURNTABLE, ModelJob
 from slrig.compute.security import require_pool_extra
 from slrig.config import RigConfig, ServiceSettings, is_loopback
+from slrig.conformance import ConformanceJob
 from slrig.discovery import open_rig
+from slrig.doctor import DoctorJob, LatencyJob
 from slrig.errors import ConfigError, InvalidInputError, ServiceError
 from slrig.jobs.compute import Compute
 from slrig.jobs.copies import Copies
@@ -46,7 +48,9 @@ from slrig.rig.session import RigSession
 from slrig.scan.job import PIPELINE, ScanJob
 from slrig.schedule.receivers import wanted_kinds
 
-KINDS = (ScanJob, VerificationJob, PoseJob, SolveJob, PositionJob, ModelJob)
+KINDS = (
+    ScanJob, VerificationJob, PoseJob, SolveJob, PositionJob, ModelJob, DoctorJob, LatencyJob, ConformanceJob,
+)  # fmt: skip
 """Every kind of job that a service runs."""
 
 ADDRESS_FILE = "service.json"

@@ -25,6 +25,7 @@ from slrig.combine.shooting import ViewShooting
 from slrig.combine.turntable import TurntableStore
 from slrig.config import ServiceSettings
 from slrig.jobs.audit import Audit, AuditEntry
+from slrig.jobs.examinations import EXAMINATIONS, Examinations
 from slrig.jobs.keys import RequestKeys
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import JobKind, JobRecord, utc_now
@@ -41,8 +42,8 @@ from slrig.schedule.tasks import Tasks
 
 _log = structlog.get_logger(__name__)
 
-_MOST_VERIFICATIONS = 1000
-"""Verifications whose job stays on record. What they found is kept longer, by `RigHealth`."""
+_MOST_ON_RECORD = 1000
+"""Verifications, and examinations of each kind, that stay on record. What verifications found is kept longer."""
 
 _SCHEDULE_END_S = 1.0
 """How long a scheduled run may take to end by itself before the runner ends it."""
@@ -90,6 +91,7 @@ class Service:
         self.calibrations = Calibrations(manager, tolerance_mm=tolerance_mm)
         self.health = RigHealth(manager.rig, NoticedHealth(database, outbox), self.folder)
         manager.groups.update(dict.fromkeys((JobKind.SCAN, JobKind.VERIFICATION), self.health))
+        manager.groups.update(dict.fromkeys(EXAMINATIONS, Examinations(self.folder.root)))
         self.acceptance = AcceptanceTests(manager, tolerance_mm=tolerance_mm)
         self.turntable = TurntableStore(self.folder.root / TURNTABLE)
         spare_bytes = settings.min_free_bytes
@@ -139,8 +141,8 @@ class Service:
             self.shooting.view_ended(record)
             self.scan_retention.look()
         try:
-            if record.kind is JobKind.VERIFICATION:
-                self.store.prune(JobKind.VERIFICATION, _MOST_VERIFICATIONS)
+            if record.kind is JobKind.VERIFICATION or record.kind in EXAMINATIONS:
+                self.store.prune(record.kind, _MOST_ON_RECORD)
             events = self.store.events(record.id, after=0)
             self.durations.ended(record, events)
             for observer in self.observers:

@@ -17,6 +17,7 @@ from slrig.capture.frame_light import FrameLight
 from slrig.capture.frame_order import describe_indices
 from slrig.capture.latency import (
     DEFAULT_SEARCH_S,
+    DEFAULT_TRIALS,
     STEADY_TOLERANCE,
     CameraLatency,
     LatencyMeasurement,
@@ -30,6 +31,7 @@ from slrig.capture.verifier import Evidence, EvidenceSummary, LightFactor, Sampl
 
 __all__ = [
     "DEFAULT_SEARCH_S",
+    "DEFAULT_TRIALS",
     "MIN_CONTRAST_DN",
     "MIN_CONTRAST_TO_NOISE",
     "NEAR_SATURATION",

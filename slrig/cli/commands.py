@@ -24,6 +24,7 @@ from slrig.cli.options import (
     BoardArguments,
     MeshOptions,
     RigFile,
+    RigHere,
     ServiceOptions,
     given,
     grouped,
@@ -274,20 +275,24 @@ def warm() -> None:
 
 
 @app.command()
-def conform(rig: RigFile, data: key.Data = None, as_json: AsJson = False) -> None:
+@grouped
+def conform(*, rig: RigHere = None, service: ServiceOptions, data: key.Data = None, as_json: AsJson = False) -> None:
     """Examine a rig by the driver contract, and score it.
 
     Exit code 1 unless every check that applies passes.
     """
     from slrig.cli.examine import conform as examine
 
-    if not examine(rig, data=data, as_json=as_json):
+    if not examine(rig, service.client(), data=data, as_json=as_json):
         raise typer.Exit(1)
 
 
 @app.command()
+@grouped
 def latency(
-    rig: RigFile,
+    *,
+    rig: RigHere = None,
+    service: ServiceOptions,
     flashes: Annotated[int, typer.Option(min=8, max=1000, help="Flashes that each camera must see happen.")] = 40,
     search_s: Annotated[float, typer.Option(min=0.01, max=10, help="How late light may be, seconds.")] = 0.5,
     exposure_s: Annotated[
@@ -297,20 +302,27 @@ def latency(
         Literal["free", "software"] | None,
         typer.Option(help="How exposures are started. Default: free where a camera can."),
     ] = None,
+    data: key.Data = None,
     as_json: AsJson = False,
 ) -> None:
     """Flash the projector: how late is its light?
 
     Tells whether the cameras have rolling shutters, too, and what to write into the rig file.
     """
-    from slrig.cli.examine import tell_latency
+    from slrig.cli.examine import latency as measure
 
-    tell_latency(rig, trials=flashes, search_s=search_s, exposure_s=exposure_s, trigger=trigger, as_json=as_json)
+    measure(
+        rig, service.client(), flashes=flashes, search_s=search_s, exposure_s=exposure_s, trigger=trigger, data=data,
+        as_json=as_json,
+    )  # fmt: skip
 
 
 @app.command()
+@grouped
 def doctor(
-    rig: RigFile,
+    *,
+    rig: RigHere = None,
+    service: ServiceOptions,
     output: Annotated[Path | None, typer.Option(help="Write a rig file with the values that were found.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file of --output.")] = False,
     search_s: Annotated[float, typer.Option(min=0.01, max=10, help="How late light may be, seconds.")] = 0.5,
@@ -323,7 +335,8 @@ def doctor(
     """
     from slrig.cli.examine import doctor as examine
 
-    if not examine(rig, output=output, force=force, search_s=search_s, data=data, as_json=as_json):
+    client = service.client()
+    if not examine(rig, client, output=output, force=force, search_s=search_s, data=data, as_json=as_json):
         raise typer.Exit(1)
 
 

@@ -1,10 +1,9 @@
-"""`slrig doctor`, `slrig conform`, `slrig latency`: a rig examined, and every finding told in words."""
+"""`slrig doctor`, `slrig conform`, `slrig latency`: a rig examined, and every finding in words."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +14,28 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from slrig.api.schemas import ScanRequest, scan_plan
-from slrig.capture import STEADY_TOLERANCE, CameraLatency, measure_latency
+from slrig.capture import STEADY_TOLERANCE, CameraLatency
 from slrig.cli.display import print_json, progress_shown
+from slrig.cli.local import run_job
 from slrig.cli.options import given
+from slrig.client import Client
 from slrig.config import RigConfig, read_rig, read_settings
-from slrig.conformance import CheckOutcome, ConformanceReport, run_checks
-from slrig.devices import Rig, Synchronisation, Trigger
-from slrig.discovery import discover_devices, installed_drivers, open_rig
-from slrig.doctor import Diagnosis, Severity, examine, refuse_existing, write_rig_file
-from slrig.errors import StorageError
+from slrig.conformance import CheckOutcome, ConformanceJob, ConformanceReport
+from slrig.devices import Synchronisation, Trigger
+from slrig.doctor import (
+    Diagnosis,
+    DoctorJob,
+    LatencyJob,
+    Severity,
+    latency_from_document,
+    refuse_existing,
+    write_rig_file,
+)
+from slrig.errors import ConfigError, StorageError
 from slrig.jobs.examinations import keep
+from slrig.jobs.job import Job
+from slrig.jobs.records import JobKind
 from slrig.logs import set_up_console_logs
-from slrig.model import PatternSequence
-from slrig.scan.plan import PatternPlan
-from slrig.scan.plan_check import pattern_sequence
 
 _COLOURS = {
     Severity.OK: "green",
@@ -42,71 +49,117 @@ _COLOURS = {
 
 
 def doctor(
-    rig_file: Path, *, output: Path | None, force: bool, search_s: float, data: Path | None, as_json: bool
+    rig_file: Path | None,
+    client: Client,
+    *,
+    output: Path | None,
+    force: bool,
+    search_s: float,
+    data: Path | None,
+    as_json: bool,
 ) -> bool:
-    """Examine the rig, print what was found, keep it in the data folder, write the new rig file, and return whether
-    there is no fault.
+    """Examine a rig, print what was found, write the new rig file, and return whether there is no fault.
 
-    Raises SlrigError where a rig file is wrong or cannot be written, or the rig cannot be opened.
+    rig_file : of the rig, which is opened here, and what was found is kept in the data folder; None for the rig of the
+    service. Raises SlrigError: a rig file is wrong or cannot be written, or the rig cannot be opened; ServiceError.
     """
     set_up_console_logs()
-    config = read_rig(rig_file)
-    lines = _own_plan(config).named
     if output is not None:
+        if rig_file is None:
+            message = "--output: the new rig file is the old one with what was measured. Name the old one, too."
+            raise ConfigError(message)
         refuse_existing(output, force=force)
-    with progress_shown() as display:
-        display("looking for displays", 0.0, "")
-        # Light engines, trigger boxes, and outputs with a display.
-        projectors = {driver.name for driver in installed_drivers() if driver.kind == "projector"}
-        displays = tuple(device for device in discover_devices().devices if device.driver in projectors)
-        display("opening the rig", 0.0, "")
-        with open_rig(config) as rig:
-            diagnosis = examine(
-                _as_scanned(rig, config),
-                own_sequence=_own_sequence(rig, config),
-                displays=displays,
-                period_px=lines.period_px,
-                steps=lines.steps or lines.period_px,
-                sines=lines.sines,
-                search_s=search_s,
-                progress=display,
-            )
-    if output is not None:
+    found, _ = _examined(rig_file, client, data, DoctorJob.kind, {"search_s": search_s})
+    diagnosis = Diagnosis.from_document(found)
+    if output is not None and rig_file is not None:
         write_rig_file(diagnosis, rig_file, output, force=force)
-    _keep(data, "doctor", diagnosis.document())
     if as_json:
-        print_json(diagnosis.document())
+        print_json(found)
     else:
-        _tell_diagnosis(diagnosis, Console(), rig_file=rig_file, output=output)
+        _print_diagnosis(diagnosis, Console(), rig_file=rig_file, output=output)
     return diagnosis.healthy
 
 
-def conform(rig: Path, *, data: Path | None, as_json: bool) -> bool:
-    """Examine the rig by the driver contract, print the report, keep it in the data folder, and return whether every
-    check that applies has passed.
+def conform(rig_file: Path | None, client: Client, *, data: Path | None, as_json: bool) -> bool:
+    """Examine a rig by the driver contract, print the report, and return whether every check that applies has passed.
 
-    Raises SlrigError where the rig file is wrong, or the rig cannot be opened.
+    rig_file, Raises : as `doctor`.
     """
     set_up_console_logs()
-    config = read_rig(rig)
-    with progress_shown() as display:
-        display("opening the rig", 0.0, "")
-        with open_rig(config) as opened:
-            sequence = _own_sequence(opened, config)
-        report = run_checks(lambda: open_rig(config), sequence, progress=display)
-    _keep(data, "conform", report.document())
+    found, fault = _examined(rig_file, client, data, ConformanceJob.kind, {})
+    report = ConformanceReport.from_document(found)
     if as_json:
-        print_json(report.document())
+        print_json(found)
     else:
-        _tell_report(report, Console())
+        _print_report(report, Console())
+    if fault is not None:
+        typer.echo(fault, err=True)
     return report.conforms
 
 
-def _keep(data: Path | None, command: str, found: Mapping[str, Any]) -> None:
-    """Keep what was found where a service shows it. An examination that cannot be kept is told all the same."""
+def latency(
+    rig_file: Path | None,
+    client: Client,
+    *,
+    flashes: int,
+    search_s: float,
+    exposure_s: float | None,
+    trigger: str | None,
+    data: Path | None,
+    as_json: bool,
+) -> None:
+    """Measure a rig's latency, and print it in words with the table for its rig file, or as JSON. See `doctor`."""
+    set_up_console_logs()
+    options = given(flashes=flashes, search_s=search_s, exposure_s=exposure_s, trigger=trigger)
+    found, _ = _examined(rig_file, client, data, LatencyJob.kind, options)
+    if as_json:
+        print_json(found)
+        return
+    synchronisation, cameras = latency_from_document(found)
+    typer.echo("\n\n".join(f"camera {name}\n{_latency_words(each)}" for name, each in cameras.items()))
+    place = "the rig file" if rig_file is None else rig_file
+    typer.echo(f"\nPut this into {place}, in place of a table of that name:\n\n{_rig_table(synchronisation)}")
+
+
+def _examined(
+    rig_file: Path | None, client: Client, data: Path | None, kind: JobKind, options: Mapping[str, Any]
+) -> tuple[dict[str, Any], str | None]:
+    """Summary of an examination, here or by the service, and why it ended before it was whole; None where it did not.
+
+    options : as POST /rig/KIND takes them. Ctrl-C ends the examination.
+    """
+    with progress_shown() as display:
+        if rig_file is None:
+            job = client.post(f"/rig/{kind}", options)
+            try:
+                job = client.examinations.wait(job["id"], display)
+            except KeyboardInterrupt:
+                client.examinations.cancel(job["id"])
+                raise
+            return job["summary"], None if job["error"] is None else job["error"]["detail"]
+        config = read_rig(rig_file)
+        display("opening the rig", 0.0, "")
+        record = run_job(config, _job(kind, config, options), display)
+    found = dict(record.summary or {})
+    _keep(data, kind, found)
+    return found, None if record.fault is None else record.fault.message
+
+
+def _job(kind: JobKind, config: RigConfig, options: Mapping[str, Any]) -> Job:
+    patterns = scan_plan(ScanRequest(), config.scan).patterns
+    if kind is JobKind.DOCTOR:
+        return DoctorJob(patterns, config.scan.exposure_s, **options)
+    if kind is JobKind.CONFORMANCE:
+        return ConformanceJob(patterns)
+    trigger = None if "trigger" not in options else Trigger(options["trigger"])
+    return LatencyJob(options["flashes"], options["search_s"], options.get("exposure_s"), trigger)
+
+
+def _keep(data: Path | None, kind: JobKind, found: Mapping[str, Any]) -> None:
+    """Keep what was found where a service shows it. What cannot be kept is printed all the same."""
     folder = read_settings(None, **given(data_dir=data)).data_dir
     try:
-        there = keep(folder, command, found)
+        there = keep(folder, kind, found)
     except StorageError as error:
         typer.echo(f"the service will not show this: {error}", err=True)
         return
@@ -114,51 +167,7 @@ def _keep(data: Path | None, command: str, found: Mapping[str, Any]) -> None:
         typer.echo(f"the service will not show this: {folder} is no data folder of slrig serve", err=True)
 
 
-def tell_latency(
-    rig_file: Path, *, trials: int, search_s: float, exposure_s: float | None, trigger: str | None, as_json: bool
-) -> None:
-    """Measure a rig's latency, and print it in words with the table for its rig file, or as JSON."""
-    set_up_console_logs()
-    kind = None if trigger is None else Trigger(trigger)
-    with open_rig(read_rig(rig_file)) as rig, progress_shown() as display:
-        measured = measure_latency(
-            rig, trials=trials, search_s=search_s, exposure_s=exposure_s, trigger=kind, on_progress=display
-        )
-    if as_json:
-        # JSON knows no NaN.
-        cameras = {
-            camera: {name: None if math.isnan(value) else value for name, value in asdict(found).items()}
-            for camera, found in measured.cameras.items()
-        }
-        print_json({"synchronisation": asdict(measured.synchronisation), "cameras": cameras})
-        return
-    typer.echo("\n\n".join(f"camera {name}\n{_latency_words(found)}" for name, found in measured.cameras.items()))
-    typer.echo(
-        f"\nPut this into {rig_file}, in place of a table of that name:\n\n{_rig_table(measured.synchronisation)}"
-    )
-
-
-def _own_plan(config: RigConfig) -> PatternPlan:
-    """The patterns of a scan on this rig as its file describes it."""
-    return scan_plan(ScanRequest(), config.scan).patterns
-
-
-def _own_sequence(rig: Rig, config: RigConfig) -> PatternSequence:
-    projector = rig.projector.info
-    return pattern_sequence(
-        _own_plan(config), projector.size, rig.calibration, rig.cameras, recorded=projector.recorded
-    )
-
-
-def _as_scanned(rig: Rig, config: RigConfig) -> Rig:
-    """The rig with the exposure that scans use, where the rig file gives one for all of them."""
-    exposure_s = config.scan.exposure_s
-    if exposure_s is None:
-        return rig
-    return replace(rig, settings={name: replace(each, exposure_s=exposure_s) for name, each in rig.settings.items()})
-
-
-def _tell_diagnosis(diagnosis: Diagnosis, console: Console, *, rig_file: Path, output: Path | None) -> None:
+def _print_diagnosis(diagnosis: Diagnosis, console: Console, *, rig_file: Path | None, output: Path | None) -> None:
     """Print a diagnosis for people: faults first, each finding with its remedy."""
     table = Table(
         Column(no_wrap=True), Column(), box=None, title=f"Rig '{escape(diagnosis.rig)}'", title_justify="left",
@@ -175,10 +184,11 @@ def _tell_diagnosis(diagnosis: Diagnosis, console: Console, *, rig_file: Path, o
     if output is not None:
         console.print(f"A rig file with these values: {escape(str(output))}")
     elif diagnosis.exposures:
-        console.print(f"For a rig file with these values: slrig doctor {escape(str(rig_file))} --output FILE.toml")
+        source = "RIG.toml" if rig_file is None else rig_file
+        console.print(f"For a rig file with these values: slrig doctor {escape(str(source))} --output FILE.toml")
 
 
-def _tell_report(report: ConformanceReport, console: Console) -> None:
+def _print_report(report: ConformanceReport, console: Console) -> None:
     """Print a report for people: a row per check, then what is wrong, then the score."""
     heads = (Column("result", no_wrap=True), Column("s", justify="right", no_wrap=True), Column("check"))
     table = Table(*heads, box=None, title=f"Conformance of rig '{escape(report.rig)}'", title_justify="left")

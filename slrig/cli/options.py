@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from slrig.client import Client
 
 RigFile = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file; examples are in config/rigs.")]
+RigHere = Annotated[
+    Path | None,
+    typer.Argument(metavar="[RIG]", help="Rig file: the rig is opened here. Default: the rig of the running service."),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Unit = Annotated[
     Literal["mm", "cm", "m", "inch"] | None,

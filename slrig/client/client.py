@@ -15,9 +15,11 @@ from slrig.client.events import Event
 from slrig.client.resources import (
     Acceptance,
     CalibrationResource,
+    Examinations,
     IfBusy,
     Models,
     PresetResource,
+    ProgressCallback,
     RigHealth,
     RigState,
     Scans,
@@ -25,7 +27,7 @@ from slrig.client.resources import (
     System,
     TurntableResource,
 )
-from slrig.client.results import ProgressCallback, ScanJob, ScanResult
+from slrig.client.results import ScanJob, ScanResult
 from slrig.errors import ServiceError
 
 
@@ -54,6 +56,7 @@ class Client:
         self.models = Models(self.connection)
         self.presets = PresetResource(self.connection)
         self.rig = RigState(self.connection)
+        self.examinations = Examinations(self.connection)
         self.calibration = CalibrationResource(self.connection)
         self.health = RigHealth(self.connection)
         self.turntable = TurntableResource(self.connection)

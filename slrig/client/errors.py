@@ -79,6 +79,15 @@ class ModelFailedError(RefusedError):
         self.model = dict(model)
 
 
+class ExaminationFailedError(RefusedError):
+    """An examination found nothing: it failed or was cancelled. examination : as it is on record."""
+
+    def __init__(self, examination: Mapping[str, Any]) -> None:
+        fault = examination["error"]
+        super().__init__({**fault, "detail": f"The examination {examination['state']}: {fault['detail']}"})
+        self.examination = dict(examination)
+
+
 _KINDS = {
     401: UnauthorizedError,
     403: UnauthorizedError,

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, Unpack
 
 from slrig.client.connection import Json, Resource, document_body, given, path
-from slrig.client.errors import ModelFailedError, RefusedError
-from slrig.client.events import Event
+from slrig.client.errors import ExaminationFailedError, ModelFailedError, RefusedError
+from slrig.client.events import Event, Progress
 
 if TYPE_CHECKING:
     from slrig.client.connection import Picture
 
 IfBusy: TypeAlias = Literal["reject", "queue"]
+ProgressCallback: TypeAlias = Callable[[str, float, str], object]
+"""Called with the stage of a job, 0 to 1 of the whole, and a detail."""
 Position: TypeAlias = int | str
 Poses: TypeAlias = Literal["turntable", "markers", "unknown"] | Sequence[Sequence[Sequence[float]]]
 """How the poses of a model's scans are found; or the poses themselves, 4 x 4 each, in mm."""
@@ -241,10 +243,6 @@ class RigState(Resource):
         """The installed drivers, the devices that are plugged in, and the missing libraries."""
         return self._connection.json("GET", "/device")
 
-    def examinations(self) -> Json:
-        """The last results of `slrig doctor` and `slrig conform` on this rig."""
-        return self._connection.json("GET", "/rig/examinations")
-
     def pictures(
         self, camera: str, *, light: Literal["off", "white"] | None = None, marks: bool | None = None
     ) -> Iterator[Picture]:
@@ -253,6 +251,67 @@ class RigState(Resource):
         light : what the projector shows; "off" by default. marks : draw saturated pixels and the board.
         """
         return self._connection.pictures(path("/preview/{}", camera), params=given(light=light, marks=marks))
+
+
+class Examinations(Resource):
+    """Examinations of the rig: doctor, latency of its light, conformance of its drivers."""
+
+    def last(self) -> Json:
+        """What each examination found last: `doctor`, `latency`, `conformance`; null where there was none."""
+        return self._connection.json("GET", "/rig/examinations")
+
+    def doctor(self, *, search_s: float | None = None, if_busy: IfBusy | None = None) -> Json:
+        """Examine light, timing, picture, response and flicker; `wait` returns the record once that is done.
+
+        search_s : longest latency to search for, seconds.
+        """
+        options = given(search_s=search_s, if_busy=if_busy)
+        return self._connection.json("POST", "/rig/doctor", once=True, json=options)
+
+    def latency(
+        self,
+        *,
+        flashes: int | None = None,
+        search_s: float | None = None,
+        exposure_s: float | None = None,
+        trigger: Literal["free", "software"] | None = None,
+        if_busy: IfBusy | None = None,
+    ) -> Json:
+        """Measure how late the light is. flashes : of each camera. trigger : how exposures are started."""
+        options = given(flashes=flashes, search_s=search_s, exposure_s=exposure_s, trigger=trigger, if_busy=if_busy)
+        return self._connection.json("POST", "/rig/latency", once=True, json=options)
+
+    def conformance(self, *, if_busy: IfBusy | None = None) -> Json:
+        """Check that the rig's drivers keep their contract."""
+        return self._connection.json("POST", "/rig/conformance", once=True, json=given(if_busy=if_busy))
+
+    def get(self, job_id: str) -> Json:
+        """An examination: its state; `summary` is what it found, or `error` why it found nothing."""
+        return self._connection.json("GET", path("/rig/job/{}", job_id))
+
+    def cancel(self, job_id: str) -> Json:
+        """Stop an examination."""
+        return self._connection.json("POST", path("/rig/job/{}/cancel", job_id))
+
+    def follow(self, job_id: str) -> Iterator[Event]:
+        """The events of an examination, from the first to the last, as they happen."""
+        return self._connection.follow(path("/rig/job/{}/events", job_id))
+
+    def wait(self, job_id: str, progress: ProgressCallback | None = None) -> Json:
+        """The record of an examination once it is done. progress : as of a scan.
+
+        Raises
+        ------
+        ExaminationFailedError
+            It failed or was cancelled before it found anything.
+        """
+        for event in self.follow(job_id):
+            if progress and isinstance(event, Progress):
+                progress(event.stage, event.fraction, event.detail)
+        record = self.get(job_id)
+        if record["state"] != "succeeded" and record["summary"] is None:
+            raise ExaminationFailedError(record)
+        return record
 
 
 class CalibrationResource(Resource):

@@ -14,6 +14,7 @@ from slrig.client.connection import Connection, Json
 from slrig.client.errors import ScanFailedError
 from slrig.client.events import Event, Progress, StateChange
 from slrig.client.notebook import shown
+from slrig.client.resources import ProgressCallback
 from slrig.errors import ScanCancelledError, ServiceError
 
 if TYPE_CHECKING:
@@ -25,9 +26,6 @@ if TYPE_CHECKING:
 
     Floats: TypeAlias = NDArray[np.float32]
     Bytes: TypeAlias = NDArray[np.uint8]
-
-ProgressCallback: TypeAlias = Callable[[str, float, str], object]
-"""Called with the stage of a scan, 0 to 1 of the whole, and a detail."""
 
 T = TypeVar("T")
 _WAITING = {"queued": "waiting for the rig", "capturing": "preparing the rig", "computing": "reconstructing"}

@@ -4,6 +4,7 @@
 """
 
 from slrig.conformance.bench import Check, Failure
+from slrig.conformance.job import ConformanceJob
 from slrig.conformance.running import CHECKS, CheckOutcome, CheckResult, ConformanceReport, ConformanceRun, run_checks
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "Check",
     "CheckOutcome",
     "CheckResult",
+    "ConformanceJob",
     "ConformanceReport",
     "ConformanceRun",
     "Failure",

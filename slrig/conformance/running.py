@@ -6,7 +6,7 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, wait
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -19,6 +19,7 @@ from slrig.conformance.bench import Check, ExpectationError, Failure, NotApplica
 from slrig.devices import Rig
 from slrig.errors import DeviceError
 from slrig.model import PatternSequence
+from slrig.rig.watchdog import Calls
 
 CHECKS = tuple(
     each
@@ -107,6 +108,18 @@ class ConformanceReport:
             "checks": [{**asdict(result), "failure": _failure_document(result.failure)} for result in self.results],
         }
 
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> Self:
+        """The report that `document` returned."""
+        results = tuple(
+            CheckResult(
+                each["name"], each["title"], CheckOutcome(each["outcome"]), each["seconds"],
+                _failure_from_document(each["failure"]), each["reason"],
+            )
+            for each in document["checks"]
+        )  # fmt: skip
+        return cls(document["rig"], results, document["seconds"], document["stopped"])
+
 
 def run_checks(
     open_rig: Callable[[], Rig],
@@ -115,23 +128,33 @@ def run_checks(
     progress: ProgressCallback = lambda _stage, _fraction, _detail: None,
     checks: Sequence[Check] = CHECKS,
     limit_s: float | None = None,
+    calls: Calls | None = None,
+    found: Callable[[ConformanceReport], None] = lambda _report: None,
 ) -> ConformanceReport:
     """Examine a rig by every check.
 
     open_rig : opens the rig; called several times, each time after the rig was closed. sequence : patterns that its
     projector can show, white and black first. progress : called with the check, the fraction done and a detail before
     and after each check, in the caller's thread. limit_s : time limit of a check; None is a minute, and more for long
-    exposures.
+    exposures. calls : see `ConformanceRun`. found : called before each check with the report as it is if that check
+    does not return.
     Raises the errors of opening the rig for the first time.
     """
     start_s = time.monotonic()
     results: list[CheckResult] = []
-    with ConformanceRun(open_rig, sequence, limit_s=limit_s) as run:
+    with ConformanceRun(open_rig, sequence, limit_s=limit_s, calls=calls) as run:
         for count, each in enumerate(checks):
             progress(each.title, count / len(checks), "")
+            hangs = f"'{each.title}' did not return"
+            unfinished = [_not_run(check, hangs) for check in checks[count:]]
+            found(ConformanceReport(run.name, (*results, *unfinished), time.monotonic() - start_s, hangs))
             results.append(run.run_check(each))
             progress(each.title, (count + 1) / len(checks), results[-1].outcome)
         return ConformanceReport(run.name, tuple(results), time.monotonic() - start_s, run.stopped)
+
+
+def _not_run(check: Check, reason: str) -> CheckResult:
+    return CheckResult(check.name, check.title, CheckOutcome.NOT_RUN, 0.0, reason=reason)
 
 
 def _failure_document(failure: Failure | None) -> dict[str, str] | None:
@@ -140,16 +163,32 @@ def _failure_document(failure: Failure | None) -> dict[str, str] | None:
     return {"asked": failure.expected, "found": failure.found, "do": failure.remedy, "where": failure.where}
 
 
+def _failure_from_document(document: Mapping[str, str] | None) -> Failure | None:
+    if document is None:
+        return None
+    return Failure(document["asked"], document["found"], document["do"], document["where"])
+
+
 class ConformanceRun:
     """Examination of a rig. A context manager that opens and closes the rig.
 
     The devices belong to one thread. A check that does not return blocks that thread: no further call is made to the
     devices, and `stopped` gives the reason. If the check returns later, the rig is closed then.
+    calls : of a service whose watchdog ends what hangs: the caller's thread owns the devices then. None starts a thread
+    of its own.
     """
 
-    def __init__(self, open_rig: Callable[[], Rig], sequence: PatternSequence, *, limit_s: float | None = None) -> None:
+    def __init__(
+        self,
+        open_rig: Callable[[], Rig],
+        sequence: PatternSequence,
+        *,
+        limit_s: float | None = None,
+        calls: Calls | None = None,
+    ) -> None:
         self._bench = RigBench(open_rig, sequence)
         self._limit_s = limit_s
+        self._calls = calls
         self._work: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = queue.SimpleQueue()
         # A daemon, so that a device that never answers cannot keep the program running.
         self._owner = threading.Thread(target=self._run_owner, name="conformance", daemon=True)
@@ -158,11 +197,12 @@ class ConformanceRun:
         self.stopped: str | None = None
 
     def __enter__(self) -> Self:
-        self._owner.start()
+        if self._calls is None:
+            self._owner.start()
         try:
             rig = self._open()
         except BaseException:
-            self._work.put(None)
+            self._close()
             raise
         self.name = rig.name
         if self._limit_s is None:
@@ -174,16 +214,14 @@ class ConformanceRun:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._work.put(None)
-        if not self._stuck:
-            self._owner.join(_CLOSING_LIMIT_S)
+        self._close()
 
     def run_check(self, check: Check) -> CheckResult:
         """Run one check. After the examination was stopped, checks are not run any more."""
         if self.stopped is not None:
-            return CheckResult(check.name, check.title, CheckOutcome.NOT_RUN, 0.0, reason=self.stopped)
+            return _not_run(check, self.stopped)
         start_s = time.monotonic()
-        answer = self._run_in_owner(lambda: self._run_on_bench(check), self._limit_s)
+        answer = self._run_in_owner(check.title, lambda: self._run_on_bench(check), self._limit_s)
         if answer.done():
             outcome, failure, reason = answer.result()
             return CheckResult(check.name, check.title, outcome, time.monotonic() - start_s, failure, reason)
@@ -201,7 +239,7 @@ class ConformanceRun:
         return CheckResult(check.name, check.title, CheckOutcome.FAILED, time.monotonic() - start_s, failure)
 
     def _open(self) -> Rig:
-        answer = self._run_in_owner(lambda: self._bench.rig, OPENING_LIMIT_S)
+        answer = self._run_in_owner("opening", lambda: self._bench.rig, OPENING_LIMIT_S)
         if not answer.done():
             raise DeviceError(
                 f"the rig did not open in {OPENING_LIMIT_S:g} s; check its devices' power and cables, and that no "
@@ -209,12 +247,24 @@ class ConformanceRun:
             )
         return answer.result()
 
-    def _run_in_owner(self, work: Callable[[], _Answer], limit_s: float | None) -> Future[_Answer]:
+    def _run_in_owner(self, title: str, work: Callable[[], _Answer], limit_s: float | None) -> Future[_Answer]:
         """Run work in the owner thread, and return its future; it is not done if the time limit passed."""
         answer: Future[_Answer] = Future()
+        if self._calls is not None:
+            answer.set_result(self._calls.make("the rig", f"'{title}'", limit_s or CHECK_LIMIT_S, work))
+            return answer
         self._work.put((work, answer))
         wait([answer], limit_s)
         return answer
+
+    def _close(self) -> None:
+        if self._calls is not None:
+            with suppress(Exception):
+                self._bench.close()
+            return
+        self._work.put(None)
+        if self._owner.ident is not None and not self._stuck:
+            self._owner.join(_CLOSING_LIMIT_S)
 
     def _run_owner(self) -> None:
         """Body of the owner thread: do work until there is no more, then close the rig."""

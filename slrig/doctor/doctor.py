@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 
-from slrig.capture import DEFAULT_SEARCH_S, LatencyMeasurement, choose_triggers, earliest_change_s
+from slrig.capture import DEFAULT_SEARCH_S, CameraLatency, LatencyMeasurement, choose_triggers, earliest_change_s
 from slrig.devices import CameraInfo, FoundDevice, ProjectorInfo, Rig, Synchronisation, UnknownPolarityProjector
 from slrig.doctor import timing
 from slrig.doctor.advice import (
@@ -43,6 +43,8 @@ from slrig.model import PatternSequence, Size
 from slrig.patterns import encode, scan_patterns
 
 ProgressCallback = Callable[[str, float, str], None]
+
+_Value = TypeVar("_Value")
 
 DEFAULT_PERIOD_PX = 8
 
@@ -77,6 +79,38 @@ class Diagnosis:
         """Return the diagnosis as JSON can hold it."""
         document: dict[str, Any] = _to_json({"healthy": self.healthy, **asdict(self)})
         return document
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> Self:
+        """The diagnosis that `document` returned."""
+        lines, curve, synchronisation = document["lines"], document["response"], document["synchronisation"]
+        if curve is not None:
+            curve = {**curve, **{name: np.asarray(curve[name], np.float64) for name in ("values", "light")}}
+        return cls(
+            rig=document["rig"],
+            findings=tuple(
+                Finding(**{**each, "severity": Severity(each["severity"])}) for each in document["findings"]
+            ),
+            exposures={name: _restored(ExposureAdvice, each) for name, each in document["exposures"].items()},
+            lines=None if lines is None else _restored(LineAdvice, lines),
+            synchronisation=None if synchronisation is None else Synchronisation(**synchronisation),
+            refresh_hz=document["refresh_hz"],
+            response=None if curve is None else _restored(ResponseCurve, curve),
+            flickers=tuple(_restored(timing.LightFlicker, each) for each in document["flickers"]),
+        )
+
+
+def latency_document(measured: LatencyMeasurement) -> dict[str, Any]:
+    """Synchronisation and latencies of the cameras as JSON can hold them."""
+    cameras = {name: asdict(each) for name, each in measured.cameras.items()}
+    document: dict[str, Any] = _to_json({"synchronisation": asdict(measured.synchronisation), "cameras": cameras})
+    return document
+
+
+def latency_from_document(document: Mapping[str, Any]) -> tuple[Synchronisation, dict[str, CameraLatency]]:
+    """What `latency_document` returned, as values."""
+    cameras = {name: _restored(CameraLatency, each) for name, each in document["cameras"].items()}
+    return Synchronisation(**document["synchronisation"]), cameras
 
 
 def doctor_sequence(size: Size) -> PatternSequence:
@@ -331,6 +365,16 @@ def _describe_displays(displays: Sequence[FoundDevice]) -> str:
 def _device_failure(stage: str, error: DeviceError, subject: str = "rig") -> Finding:
     remedy = "correct that, and run the doctor again; slrig conform finds faults of drivers"
     return fault("device.failed", subject, f"the examination of {stage} failed on a device: {error}", remedy)
+
+
+def _restored(kind: type[_Value], document: Mapping[str, Any]) -> _Value:
+    """A dataclass from its JSON values: NaN where a float is null, tuples where it has lists."""
+    floats = {each.name for each in fields(cast("Any", kind)) if each.type == "float"}
+    values = {
+        name: math.nan if each is None and name in floats else tuple(each) if isinstance(each, list) else each
+        for name, each in document.items()
+    }
+    return kind(**values)
 
 
 def _to_json(value: Any) -> Any:

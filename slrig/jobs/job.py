@@ -53,7 +53,8 @@ class JobRun:
     file_ready : takes the name of a file that can be fetched before the job is over. frames : takes the frames of a
     capture while they come; None where they are not computed meanwhile. live : in the worker, the scan that took them.
     evidence : what the frames proved as they were captured. where : where it is computed, for a report. pipeline : the
-    module that the worker has prepared: `slrig.scan.reconstruct`.
+    module that the worker has prepared: `slrig.scan.reconstruct`. found : takes the summary as it is so far, which
+    stays on record where the capture ends by an error.
     """
 
     id: UUID
@@ -67,12 +68,18 @@ class JobRun:
     evidence: EvidenceSummary | None = None
     where: Mapping[str, str] = field(default_factory=lambda: {"where": "local"})
     pipeline: Any = None
+    found: Callable[[Mapping[str, Any]], None] = lambda _: None
 
     def check(self) -> None:
         """Raise ScanCancelledError once the job is to end early."""
         if self.cancelled():
-            message = "It was cancelled while it was computed."
+            message = "It was cancelled."
             raise ScanCancelledError(message)
+
+    def step(self, stage: str, fraction: float, detail: str, /) -> None:
+        """Report progress, and raise ScanCancelledError once the job is to end early."""
+        self.report(stage, fraction, detail)
+        self.check()
 
     @property
     def recording(self) -> Path:
@@ -155,9 +162,9 @@ class Job:
         """Raise what the rig cannot do of this, as far as it is known; return the bytes that are needed on the disk."""
         return 0
 
-    def capture(self, rig: RigSession, run: JobRun) -> Recording | None:
+    def capture(self, rig: RigSession, run: JobRun) -> Recording | Outcome | None:
         """Use the rig, on its thread; for kinds with `uses_rig`. Return the recording that is still being written to
-        `run.recording`; None without one.
+        `run.recording`; None without one; of a kind that does not compute, what it found.
         """
         raise NotImplementedError
 

@@ -181,15 +181,16 @@ class JobManager:
 
     # Requests
 
-    def start(self) -> None:
-        """Open the rig, on its own thread, and have the worker load its kernels."""
+    def start(self, *, prepare: bool = True) -> None:
+        """Open the rig, on its own thread. prepare : have the worker load its kernels at once, not when one is used."""
         # With the lock held, so that a job that the owner captures meanwhile is computed once.
         with self._changed:
             self._owner.start()
             for work in self._computing:
                 self._begin_computing(work)
         self._watchdog.start()
-        self.worker.start()
+        if prepare:
+            self.worker.start()
 
     def submit(
         self,
@@ -566,13 +567,17 @@ class JobManager:
                 self.require_space(job.check(rig))
                 if job.feeds:
                     work.feed = self.worker.feed(job.region)
-                work.recording = job.capture(rig, self._run_of(work, self._progress(work, 0.0, job.capture_share)))
+                made = job.capture(rig, self._run_of(work, self._progress(work, 0.0, job.capture_share)))
+            if not isinstance(made, Outcome):
+                work.recording = made
         except Exception as error:
             rig.doubt(error)
             raise
         if work.stop.is_set():
             message = "It was cancelled when all of its frames had come."
             raise ScanCancelledError(message)
+        if isinstance(made, Outcome):
+            work.outcome = self._kept(work, made)
 
     def _frees_rig(self, work: _Work) -> bool:
         """Free the rig of a job whose second part is begun. One that was given up while its driver hung is over,
@@ -685,6 +690,10 @@ class JobManager:
 
     def _run_of(self, work: _Work, progress: ProgressRecorder) -> JobRun:
         feed = work.feed
+
+        def found(summary: Mapping[str, Any]) -> None:
+            work.outcome = Outcome(summary)
+
         return JobRun(
             work.id,
             self.data.staging(work.id),
@@ -694,6 +703,7 @@ class JobManager:
             progress.file_made,
             frames=feed,
             evidence=None if feed is None else feed.evidence,
+            found=found,
         )
 
     def _progress(self, work: _Work, begin: float, end: float) -> ProgressRecorder:
@@ -769,6 +779,7 @@ class JobManager:
             if end.state is JobState.FAILED and not work.worked and work.stop.is_set():
                 # It was to end, and its driver hangs.
                 end = replace(end, state=JobState.CANCELLED)
+            end = replace(end, outcome=replace(end.outcome, summary=work.outcome.summary))
             self._ends.append(end)
 
     def _settle(self, work: _Work) -> None:

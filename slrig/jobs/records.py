@@ -57,6 +57,22 @@ class JobKind(StrEnum):
     SOLVE = "solve"
     POSITION = "position"
     MODEL = "model"
+    DOCTOR = "doctor"
+    CONFORMANCE = "conformance"
+    LATENCY = "latency"
+
+    @property
+    def path(self) -> str:
+        """Path of the service below which jobs of this kind are found by their ids. Those of a calibration or an
+        acceptance test are found below that.
+
+        >>> JobKind.SCAN.path, JobKind.DOCTOR.path
+        ('/scan', '/rig/job')
+        """
+        return _PATHS.get(self, "/rig/job")
+
+
+_PATHS = {JobKind.SCAN: "/scan", JobKind.MODEL: "/model", JobKind.VERIFICATION: "/rig/verification"}
 
 
 class JobState(StrEnum):
@@ -151,10 +167,6 @@ def holder_of(record: JobRecord) -> Holder:
     """Who holds the rig for a job."""
     job, group = f"{record.kind} {record.id}", record.parent
     match record.kind:
-        case JobKind.SCAN:
-            return Holder(str(record.id), job, f"/scan/{record.id}")
-        case JobKind.VERIFICATION:
-            return Holder(job, job, f"/rig/verification/{record.id}")
         case JobKind.POSE:
             words = f"calibration {group}, pose {record.plan['number']}"
             return Holder(words, words, f"/calibration/{group}/pose/{record.plan['number']}")
@@ -164,8 +176,9 @@ def holder_of(record: JobRecord) -> Holder:
         case JobKind.POSITION:
             words = f"acceptance test {group}"
             return Holder(words, words, f"/acceptance/{group}")
-        case JobKind.MODEL:
-            return Holder(job, job, f"/model/{record.id}")
+        case kind:
+            name = str(record.id) if kind is JobKind.SCAN else job
+            return Holder(name, job, f"{kind.path}/{record.id}")
 
 
 _PARENTS = {
@@ -182,7 +195,7 @@ def reference(job: JobRecord) -> dict[str, Any]:
     `acceptance` that it belongs to, if it belongs to one, and `links`, by paths of the service.
     """
     named: dict[str, Any] = {"id": str(job.id), "kind": str(job.kind), "label": job.label}
-    links = {"self": f"/{'rig/verification' if job.kind is JobKind.VERIFICATION else job.kind}/{job.id}"}
+    links = {"self": f"{job.kind.path}/{job.id}"}
     links["events"] = f"{links['self']}/events"
     if job.parent is not None:
         name, room = _PARENTS[job.kind]

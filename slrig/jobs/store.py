@@ -34,6 +34,7 @@ _LISTED: dict[str, str] = {
     JobKind.SCAN: "GET /scan lists those that are.",
     JobKind.VERIFICATION: "GET /rig/health/history lists past ones.",
     JobKind.MODEL: "GET /model lists those that are.",
+    **dict.fromkeys((JobKind.DOCTOR, JobKind.CONFORMANCE), "GET /rig/examinations has the last one."),
 }
 
 

@@ -1,7 +1,7 @@
 // Devices: the rig as it is and as it is set, what else is plugged in, what examinations found, and who is logged in.
-import {html} from "./vendor/preact-htm.js";
-import {useAction, useValue} from "./service.js";
-import {Action, Badge, Facts, Refusal, moment, percent} from "./ui.js";
+import {html, useEffect, useState} from "./vendor/preact-htm.js";
+import {ask, follow, once, useAction, useValue} from "./service.js";
+import {Action, Badge, Facts, Progress, Refusal, moment, percent} from "./ui.js";
 
 const short = (value) => Number(value.toPrecision(3));
 const duration = (seconds) => (seconds < 1e-3 ? `${short(1e6 * seconds)}\u00a0µs` : seconds < 1 ? `${short(1e3 * seconds)}\u00a0ms` : `${short(seconds)}\u00a0s`);
@@ -10,7 +10,7 @@ const between = ([least, most], words) => (least === most ? `${words(least)} onl
 export function DevicesScreen({rig, may}) {
   return html`<section aria-label="This rig"><${ThisRig} rig=${rig} /></section>
     <section aria-label="Plugged in"><${PluggedIn} rig=${rig} /></section>
-    <section aria-label="Examinations"><${Examinations} /></section>
+    <section aria-label="Examinations"><${Examinations} rig=${rig} may=${may} /></section>
     <section aria-label="You"><${You} may=${may} /></section>`;
 }
 
@@ -72,19 +72,54 @@ function PluggedIn({rig}) {
       ${found.elsewhere.map(({message}) => html`<p class="quiet">${message}</p>`)}</details>`}`;
 }
 
-function Examinations() {
-  const [kept, problem] = useValue("/rig/examinations", 10);
-  if (!kept) return html`<${Refusal} problem=${problem?.status ? problem : null} />`;
-  const how = (name, what) => html`<p class="quiet">${what} Stop the service, run this where it runs, with its rig file, and start it again:
-    ${" "}<code>${kept.commands[name]}</code></p>`;
+function Examinations({rig, may}) {
+  const [last, problem, again] = useValue("/rig/examinations", 10);
+  if (!last) return html`<${Refusal} problem=${problem?.status ? problem : null} />`;
+  const given = {rig, may, ended: again};
   return html`<div class="halves">
     <div class="box"><h2>Doctor</h2>
-      ${kept.doctor ? html`<${Doctor} ...${kept.doctor} />` : html`<p>Not examined yet.</p>`}
-      ${how("doctor", "It looks for faults of light, timing, focus and flicker before a still object.")}</div>
+      ${last.doctor ? html`<${Doctor} ...${last.doctor} />` : html`<p>Not examined yet.</p>`}
+      <${Examine} kind="doctor" ...${given}>It looks for faults of light, timing, focus and flicker. Put a light, still object before the rig.<//></div>
     <div class="box"><h2>Conformance</h2>
-      ${kept.conform ? html`<${Conformance} ...${kept.conform} />` : html`<p>Not examined yet.</p>`}
-      ${how("conform", "It checks that the drivers keep what they promise.")}</div>
+      ${last.conformance ? html`<${Conformance} ...${last.conformance} />` : html`<p>Not examined yet.</p>`}
+      <${Examine} kind="conformance" ...${given}>It checks that the drivers keep what they promise: the rig is closed and opened many times.<//></div>
   </div>`;
+}
+
+/** Starts an examination, and shows it while it runs, also one that somebody else started. */
+function Examine({kind, rig, may, ended, children}) {
+  const [job, setJob] = useState(null);
+  const other = new RegExp(`^${kind} (.+)$`).exec(rig?.holder ?? "")?.[1];
+  useEffect(() => {
+    if (other) setJob(other);
+  }, [other]);
+  const [start, busy, refused] = useAction(async () => setJob((await ask("POST", `/rig/${kind}`, {body: {if_busy: "queue"}, headers: once()})).id));
+  return html`<p class="quiet">${children}</p>
+    ${job ? html`<${Examining} key=${job} here=${`/rig/job/${job}`} may=${may} ended=${() => (setJob(null), ended())} />`
+      : html`<${Action} busy=${busy} disabled=${!may("calibrate")} onClick=${start}>Examine now<//>`}
+    <${Refusal} problem=${refused} />`;
+}
+
+function Examining({here, may, ended}) {
+  const [at, setAt] = useState({stage: "waits for the rig", fraction: 0});
+  const [failed, setFailed] = useState(null);
+  useEffect(() => {
+    const look = async () => {
+      const body = await ask("GET", here);
+      if (body.error) setFailed(body.error);
+      else if (body.state === "succeeded") ended();
+    };
+    return follow(`${here}/events`, (kind, data) => {
+      if (kind === "progress") setAt(data);
+      if (kind === "state") look();
+    }, look);
+  }, [here]);
+  const [cancel, busy, refused] = useAction(() => ask("POST", `${here}/cancel`));
+  if (failed) return html`<${Refusal} problem=${{document: {title: "The examination ended early"}, message: failed.detail}}>
+    <${Action} onClick=${ended}>Close<//><//>`;
+  return html`<${Progress} label=${at.stage} fraction=${at.fraction} detail=${at.detail} />
+    <${Action} busy=${busy} disabled=${!may("calibrate")} onClick=${cancel}>Cancel<//>
+    <${Refusal} problem=${refused} />`;
 }
 
 const SEVERITIES = {fault: "bad", note: "warn", ok: "good"};

@@ -178,6 +178,15 @@ class RigSession:
         if self._rig is not None and self.calls.failure is not None:
             self.let_go(self.calls.failure)
 
+    def open_for_checks(self) -> Rig:
+        """Close the rig, and return it opened once more, for checks of its drivers. No watch is kept over its calls,
+        and the caller closes it. May be called again afterwards. `recover` opens the rig as usual. Raises as `open`.
+        """
+        self.let_go()
+        self._dropped = True
+        self._bare = self._opened()
+        return self._bare
+
     def try_open(self) -> Exception | None:
         """Open the rig, or return why it cannot be opened, which `fault` keeps. The next scan tries again."""
         try:

@@ -31,6 +31,7 @@ from slrig.devices import (
     Rig,
     Trigger,
     Turntable,
+    UnknownPolarityProjector,
     listen_for_progress,
 )
 from slrig.errors import (
@@ -224,9 +225,16 @@ def guarded(rig: Rig, calls: Calls, settings: dict[str, SettingsInUse]) -> Rig:
     return replace(
         rig,
         cameras={name: _GuardedCamera(camera, name, calls, settings) for name, camera in rig.cameras.items()},
-        projector=_GuardedProjector(rig.projector, f"projector '{rig.projector.info.name}'", calls),
+        projector=_guarded_projector(rig.projector, calls),
         positioner=_guarded_positioner(rig.positioner, calls),
     )
+
+
+def _guarded_projector(projector: Projector, calls: Calls) -> Projector:
+    name = f"projector '{projector.info.name}'"
+    if isinstance(projector, UnknownPolarityProjector):
+        return _GuardedUnknownPolarityProjector(projector, name, calls)
+    return _GuardedProjector(projector, name, calls)
 
 
 def _guarded_positioner(positioner: Positioner | None, calls: Calls) -> GuardedPositioner | None:
@@ -310,6 +318,28 @@ class _GuardedProjector(_Guarded[Projector]):
 
     def blank(self) -> None:
         self._made("blank", self._device.blank)
+
+
+class _GuardedUnknownPolarityProjector(_GuardedProjector):
+    """Implements `slrig.devices.UnknownPolarityProjector` by another one."""
+
+    def __init__(self, projector: UnknownPolarityProjector, name: str, calls: Calls) -> None:
+        super().__init__(projector, name, calls)
+        self._projector = projector
+
+    @property
+    def is_polarity_unknown(self) -> bool:
+        return self._projector.is_polarity_unknown
+
+    @property
+    def light_period_s(self) -> float:
+        return self._projector.light_period_s
+
+    def set_trial_current(self, share: float) -> None:
+        self._made("set_trial_current", lambda: self._projector.set_trial_current(share))
+
+    def polarity_option(self, *, rises: bool) -> str:
+        return self._projector.polarity_option(rises=rises)
 
 
 class GuardedPositioner:

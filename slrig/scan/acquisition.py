@@ -39,7 +39,7 @@ from slrig.model import CaptureHeader, Shot, Truth
 from slrig.rig.turn_count import CountedTurntable
 from slrig.scan.bracketing import Exposing
 from slrig.scan.plan import ProgressCallback, ScanPlan
-from slrig.scan.plan_check import in_colour, no_turntable, pattern_sequence
+from slrig.scan.plan_check import in_colour, no_turntable, rig_sequence
 
 MOST_WAITING_BYTES = 256 * 2**20
 """How much of frames may wait for the disk."""
@@ -192,15 +192,7 @@ def capture_frames(
     StorageError
         The disk refused. In these cases nothing is left in `folder`. In every case the projector is dark.
     """
-    sequence = pattern_sequence(
-        plan.patterns,
-        rig.projector.info.size,
-        rig.calibration,
-        rig.cameras,
-        axis=plan.reconstruction.axis,
-        recorded=rig.projector.info.recorded,
-        coloured_light=plan.coloured_light,
-    )
+    sequence = rig_sequence(plan, rig)
     rig, exposures_s, told = exposed(rig, plan)
     told += _of_the_rig(rig)
     for words in told:

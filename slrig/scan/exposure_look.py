@@ -19,7 +19,7 @@ from slrig.patterns import encode
 from slrig.rig.session import RigSession
 from slrig.scan.exposure_proposal import WELL_CLEAR, Look, Proposal, SeenObject, proposal, seen_object
 from slrig.scan.plan import ScanPlan
-from slrig.scan.plan_check import pattern_sequence
+from slrig.scan.plan_check import rig_sequence
 
 LONGEST_S = 1.0
 """No look exposes longer; a scan of thirty frames would take half a minute."""
@@ -145,13 +145,7 @@ def proposed_exposures(manager: JobManager, plan: ScanPlan, *, budget_s: float |
 
     def look(held: RigSession, cancelled: Callable[[], bool]) -> tuple[Looking, int]:
         rig = held.open()
-        frames = len(
-            pattern_sequence(
-                plan.patterns, rig.projector.info.size, rig.calibration, rig.cameras,
-                axis=plan.reconstruction.axis, recorded=rig.projector.info.recorded,
-                coloured_light=plan.coloured_light,
-            )
-        )  # fmt: skip
+        frames = len(rig_sequence(plan, rig))
         looking = Looking(rig, cancelled=cancelled)
         looking.look()
         return looking, frames

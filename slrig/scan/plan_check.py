@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from slrig.bundle import MAX_CAPTURE_BYTES
-from slrig.devices import CameraInfo, ProjectorInfo
+from slrig.devices import CameraInfo, ProjectorInfo, Rig
 from slrig.errors import UnsupportedByDeviceError, setting
 from slrig.model import Axis, Black, Calibration, Pattern, PatternSequence, Sine, Size, White
 from slrig.patterns import encode, phase_patterns, scan_patterns, with_cross_lines
@@ -57,6 +57,15 @@ def pattern_sequence(
     if plan.cross_lines and rows != columns:
         patterns = with_cross_lines(patterns, Axis.COLUMN if rows else Axis.ROW)
     return encode(patterns, size)
+
+
+def rig_sequence(plan: ScanPlan, rig: Rig) -> PatternSequence:
+    """The patterns of a scan on an open rig. Raises PatternError."""
+    projector = rig.projector.info
+    return pattern_sequence(
+        plan.patterns, projector.size, rig.calibration, rig.cameras, axis=plan.reconstruction.axis,
+        recorded=projector.recorded, coloured_light=plan.coloured_light,
+    )  # fmt: skip
 
 
 def in_colour(plan: ScanPlan, cameras: Mapping[str, CameraInfo], projector: ProjectorInfo) -> frozenset[str]:

@@ -21,13 +21,10 @@ from slrig.errors import (
     CalibrationNotFoundError,
     CalibrationStateError,
     DeviceError,
-    LibraryMissingError,
-    RigBusyError,
     ScanCancelledError,
-    SlrigError,
     WorkerLostError,
 )
-from slrig.failure import JobFailure, errors_by_code, job_failure
+from slrig.failure import error_of, job_failure
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import Holder, JobState
 from slrig.jobs.store import JobStore
@@ -65,17 +62,6 @@ class Stop:
                 self._news.clear()
         finally:
             unwatch()
-
-
-def error_of(fault: JobFailure) -> SlrigError:
-    """The error that a recorded fault stands for.
-
-    >>> error_of(JobFailure("pose-refused", "no camera sees the board"))
-    PoseRefusedError('no camera sees the board')
-    """
-    kind = errors_by_code().get(fault.code, SlrigError)
-    # These two take more than a message.
-    return DeviceError(fault.message) if kind in {RigBusyError, LibraryMissingError} else kind(fault.message)
 
 
 class VerificationTask:

@@ -32,7 +32,7 @@ from tests.e2e.test_model_walk import ANGLES, TURNTABLE, on_a_turntable
 from tests.unit.catalogue.test_store import job, row
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Locator, Page, Route
+    from playwright.sync_api import Locator, Page
 
 pytestmark = pytest.mark.slow
 
@@ -43,18 +43,11 @@ PLUGGED_IN = {
 
 
 def looks_as_elsewhere(page: Page, name: str) -> None:
-    """`looks_as_kept` with one device, not those of this machine, and without a path of it."""
-
-    def without_path(route: Route) -> None:
-        found = route.fetch()
-        commands = {name: f"slrig {name} RIG.toml --data DATA" for name in ("doctor", "conform")}
-        route.fulfill(response=found, json={**found.json(), "commands": commands})
-
+    """`looks_as_kept` with one device, not those of this machine."""
     page.route("**/device", lambda route: route.fulfill(json=PLUGGED_IN))
-    page.route("**/rig/examinations", without_path)
     page.reload()
     page.get_by_role("cell", name="a camera of no rig").wait_for()
-    page.get_by_text("slrig doctor RIG.toml --data DATA").wait_for()
+    page.get_by_role("button", name="Examine now").first.wait_for()
     page.get_by_role("banner").get_by_text("ready").wait_for()
     looks_as_kept(page, name)
     page.unroute_all(behavior="ignoreErrors")
@@ -86,6 +79,11 @@ def test_devices_are_shown_as_set_and_as_examined(start: Start, tmp_path: Path, 
     page.get_by_text("it is sharp").wait_for()
     assert violations(page) == []
     looks_as_elsewhere(page, "devices")
+    # Examined from the page, which shows what was found in place of the last.
+    page.get_by_role("button", name="Examine now").first.click()
+    page.get_by_role("button", name="Cancel").wait_for()
+    page.get_by_text("it is too dark").wait_for(state="detached", timeout=120_000)
+    keep(service.data, "doctor", Diagnosis("small", findings, {}, None, None, None, None, ()).document())
 
     # On a phone, by a key for looking.
     failure = Failure("every frame shows its own pattern", "light of another one", "wait for it", "camera 'left'")
@@ -94,7 +92,7 @@ def test_devices_are_shown_as_set_and_as_examined(start: Start, tmp_path: Path, 
         CheckResult("wires", "Wires trigger", CheckOutcome.NOT_APPLICABLE, 0.0, None, "it needs a wire"),
         *(CheckResult(f"check {number}", "All is well", CheckOutcome.PASSED, 0.1) for number in range(2)),
     )
-    keep(service.data, "conform", ConformanceReport("small", results, 1.2).document())
+    keep(service.data, "conformance", ConformanceReport("small", results, 1.2).document())
     secret = looking(service)
     page = visit(service, "devices", key=secret, size=PHONE, dark=True)
     page.get_by_text("66 %").wait_for()

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import pytest
 from fastapi import APIRouter, FastAPI
 from fastapi.testclient import TestClient
@@ -17,6 +18,8 @@ from slrig.api.problems import install_problems
 from slrig.api.server import KINDS
 from slrig.api.service import Service, _of_request
 from slrig.bundle.options import ScanDefaults
+from slrig.cli.options import ServiceOptions
+from slrig.client import Client
 from slrig.config import ServiceSettings
 from slrig.jobs.compute import Compute
 from slrig.jobs.copies import Copies
@@ -99,6 +102,22 @@ def client(session: TestClient, served: ServedBench) -> Iterator[TestClient]:
             session.post(f"/scan/{scan['id']}/cancel")
             ended(session, scan["id"])
         session.delete(f"/scan/{scan['id']}")
+
+
+@pytest.fixture
+def commands(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The client of commands that are run in this process reaches the service."""
+
+    def forward(request: httpx2.Request) -> httpx2.Response:
+        path, headers = request.url.raw_path.decode(), dict(request.headers)
+        answer = client.request(request.method, path, content=request.read(), headers=headers)
+        kind = {"content-type": answer.headers.get("content-type", "")}
+        return httpx2.Response(answer.status_code, content=answer.content, headers=kind)
+
+    def reaching(_service: ServiceOptions) -> Client:
+        return Client("http://127.0.0.1:1", KEY, transport=httpx2.MockTransport(forward))
+
+    monkeypatch.setattr(ServiceOptions, "client", reaching)
 
 
 def client_of(served: ServedBench, *, key: str | None = KEY) -> TestClient:

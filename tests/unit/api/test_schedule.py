@@ -11,18 +11,15 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 from uuid import UUID
 
-import httpx2
 import pytest
 from fastapi.testclient import TestClient
 from typer.testing import Result
 
 from slrig.bundle.calibration import write_calibration
-from slrig.cli.options import ServiceOptions
-from slrig.client import Client
 from slrig.schedule.records import RunState
 from slrig.schedule.rig_tasks import Stop
 from tests.unit import command
-from tests.unit.api.conftest import KEY, ServedBench, refusal
+from tests.unit.api.conftest import ServedBench, refusal
 from tests.unit.command import refused, slrig
 from tests.unit.scan.fakes import WAIT_S
 
@@ -37,19 +34,9 @@ NIGHTLY = ("add", "0 2 * * *", "verification", "--option", f"board={json.dumps(B
 
 
 @pytest.fixture(autouse=True)
-def emptied(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The command's client reaches the service; afterwards no schedule is left."""
-
-    def forward(request: httpx2.Request) -> httpx2.Response:
-        path, headers = request.url.raw_path.decode(), dict(request.headers)
-        answer = client.request(request.method, path, content=request.read(), headers=headers)
-        kind = {"content-type": answer.headers.get("content-type", "")}
-        return httpx2.Response(answer.status_code, content=answer.content, headers=kind)
-
-    def reaching(_service: ServiceOptions) -> Client:
-        return Client("http://127.0.0.1:1", KEY, transport=httpx2.MockTransport(forward))
-
-    monkeypatch.setattr(ServiceOptions, "client", reaching)
+def emptied(client: TestClient, commands: None) -> Iterator[None]:
+    """Afterwards no schedule is left."""
+    del commands
     yield
     for each in kept(client):
         assert client.delete(each["links"]["self"]).status_code == 204

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import json
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +15,17 @@ from starlette.types import Message, Receive, Scope, Send
 
 from slrig.api import latency
 from slrig.api.latency import Durations, Latency
+from slrig.capture import CameraLatency, LatencyMeasurement
+from slrig.conformance import CheckOutcome, CheckResult, ConformanceReport, Failure
+from slrig.conformance import job as conforming
 from slrig.devices import AppliedSettings, CameraSettings
+from slrig.doctor import job as examining
+from slrig.errors import ScanEvidenceError
 from slrig.jobs.examinations import keep
 from slrig.rig.settings import SettingsInUse
 from tests.unit.api.conftest import ServedBench, client_of, ended
 from tests.unit.api.test_access import PATHS, filled
+from tests.unit.command import done, refused, slrig
 from tests.unit.jobs.tame_compute import TameCompute
 
 ANSWERS, JOBS, STAGES = (
@@ -49,16 +57,65 @@ def test_drivers_and_devices_are_listed(client: TestClient) -> None:
     assert ("head", "simulated", None) in [(each["kind"], each["name"], each["fault"]) for each in found["drivers"]]
 
 
-def test_last_examinations_of_the_rig_are_shown_with_what_to_run(client: TestClient, served: ServedBench) -> None:
-    root = served.service.folder.root
-    found = client.get("/rig/examinations").json()
-    assert (found["doctor"], found["conform"]) == (None, None)
-    assert found["commands"]["doctor"] == f"slrig doctor RIG.toml --data {root}"
-    for rig in ("bench", "another"):
-        keep(root, "doctor" if rig == "bench" else "conform", {"rig": rig, "findings": []})
-    found = client.get("/rig/examinations").json()
-    assert found["doctor"]["found"] == {"rig": "bench", "findings": []}
-    assert found["conform"] is None
+def no_light(*_: object, **__: object) -> LatencyMeasurement:
+    raise ScanEvidenceError("camera 'cam0' sees no flash")
+
+
+EXAMINATIONS = {"doctor": "healthy", "latency": "cameras", "conformance": "checks"}
+
+
+def test_an_examination_is_a_job_whose_result_is_shown_as_the_last(
+    client: TestClient, served: ServedBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    times_s = dict.fromkeys((each.name for each in fields(CameraLatency)), 0.01)
+    latency = CameraLatency(**times_s)  # type: ignore[arg-type] # numbers, and none of them counts
+    monkeypatch.setattr(examining, "measure_latency", lambda *_, **__: LatencyMeasurement({"cam0": latency}, 1e-4))
+    report = ConformanceReport("bench", (CheckResult("one", "One", CheckOutcome.PASSED, 0.1),), 0.1)
+    monkeypatch.setattr(conforming, "run_checks", lambda *_, **__: report)
+    keep(served.service.folder.root, "latency", {"rig": "another"})
+    assert client.get("/rig/examinations").json() == dict.fromkeys(EXAMINATIONS)
+    for kind, has in EXAMINATIONS.items():
+        answer = client.post(f"/rig/{kind}", headers={"Idempotency-Key": "one"})
+        begun = answer.json()
+        assert (answer.status_code, answer.headers["Location"]) == (202, begun["links"]["self"])
+        assert client.post(f"/rig/{kind}", headers={"Idempotency-Key": "one"}).json()["id"] == begun["id"]
+        assert "succeeded" in client.get(begun["links"]["events"]).text
+        done = client.get(begun["links"]["self"]).json()
+        assert (done["state"], done["error"], done["summary"]["rig"]) == ("succeeded", None, "bench")
+        assert has in done["summary"]
+        assert client.get(begun["links"]["last"]).json()[kind]["found"] == done["summary"]
+    assert done["summary"]["checks"][0]["outcome"] == "passed"
+
+
+@pytest.mark.usefixtures("commands")
+def test_without_a_rig_file_the_commands_examine_the_rig_of_the_service(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    found = json.loads(done("doctor", "--json"))
+    assert (found["rig"], found["healthy"]) == ("bench", True)
+    assert "no faults, no notes" in done("doctor")
+    assert "Name the old one, too." in refused(slrig("doctor", "--output", tmp_path / "new.toml"))
+    report = ConformanceReport(
+        "bench", (CheckResult("one", "One", CheckOutcome.FAILED, 0.1, Failure("a", "b", "c")),), 0.1
+    )
+    monkeypatch.setattr(conforming, "run_checks", lambda *_, **__: report)
+    shown = slrig("conform")
+    assert (shown.exit_code, "0 %: 0 of 1 checks" in shown.stdout) == (1, True)
+    monkeypatch.setattr(examining, "measure_latency", no_light)
+    assert "camera 'cam0' sees no flash" in refused(slrig("latency"))
+
+
+@pytest.mark.parametrize("kind", EXAMINATIONS)
+def test_an_examination_holds_the_rig_and_can_be_cancelled(client: TestClient, served: ServedBench, kind: str) -> None:
+    scan = served.held(client)
+    refused = client.post(f"/rig/{kind}")
+    assert (refused.status_code, refused.json()["type"]) == (409, "/problems/rig-busy")
+    waiting = client.post(f"/rig/{kind}", json={"if_busy": "queue"}).json()
+    assert client.post(waiting["links"]["cancel"]).json()["state"] == "cancelled"
+    served.gate.set()
+    ended(client, scan["id"])
+    missing = client.get(f"/rig/job/{scan['id']}")
+    assert (missing.status_code, missing.json()["type"]) == (404, "/problems/job-not-found")
 
 
 def test_probes_say_what_is_missing(client: TestClient, served: ServedBench, monkeypatch: pytest.MonkeyPatch) -> None:

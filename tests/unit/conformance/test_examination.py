@@ -12,9 +12,19 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from slrig.cli import examine
+from slrig.cli import local
 from slrig.cli.commands import app
-from slrig.conformance import CHECKS, CheckOutcome, CheckResult, ConformanceReport, ConformanceRun, Failure, run_checks
+from slrig.conformance import (
+    CHECKS,
+    CheckOutcome,
+    CheckResult,
+    ConformanceJob,
+    ConformanceReport,
+    ConformanceRun,
+    Failure,
+    job,
+    run_checks,
+)
 from slrig.conformance.bench import (
     ExpectationError,
     Need,
@@ -24,10 +34,22 @@ from slrig.conformance.bench import (
     measure_reference_levels,
 )
 from slrig.devices import Rig
-from slrig.errors import DeviceBusyError, DeviceGoneError
+from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError
+from slrig.jobs import manager as managing
+from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.database import Database
 from slrig.jobs.examinations import last_examination
+from slrig.jobs.manager import JobManager
+from slrig.jobs.records import JobState
+from slrig.jobs.store import JobStore
 from slrig.model import Pixels
+from slrig.rig.session import RigSession
+from slrig.rig.watchdog import Watchdog
+from slrig.scan.plan import PatternPlan
 from tests.unit.conformance.model_rig import DeliversStale, Hangs, LightsLate, Maker, ModelProjector, StaysLit, sequence
+from tests.unit.jobs.tame_compute import TameCompute
+from tests.unit.scan.bench import PIPELINE
+from tests.unit.scan.fakes import WAIT_S
 
 
 def owners() -> set[threading.Thread]:
@@ -255,14 +277,14 @@ def test_conform_prints_faults_and_remedies(
 ) -> None:
     # Two checks of all: what comes of them is tested by `test_broken_drivers`.
     few = [check for check in CHECKS if check.name in {LATE, "show_needs_a_loaded_sequence"}]
-    monkeypatch.setattr(examine, "run_checks", partial(run_checks, checks=few))
-    monkeypatch.setattr(examine, "open_rig", lambda _config: Maker(projector=projector)())
+    monkeypatch.setattr(job, "run_checks", partial(run_checks, checks=few))
+    monkeypatch.setattr(local, "open_rig", lambda _config: Maker(projector=projector)())
     data = tmp_path / "data"
     (data / "scans").mkdir(parents=True)
     shown = CliRunner().invoke(app, ["conform", str(rig), "--data", str(data)])
     assert shown.exit_code == (0 if passed == 2 else 1), shown.output
     assert f"{50 * passed} %: " in shown.stdout
-    kept = last_examination(data, "conform", "model")
+    kept = last_examination(data, "conformance", "model")
     assert kept is not None
     assert f"{kept.found['passed']} of {kept.found['applicable']} checks" in shown.stdout
     calls = " ".join(shown.stdout.split())
@@ -274,6 +296,35 @@ def test_conform_prints_faults_and_remedies(
     assert (document["rig"], document["conforms"], document["score"]) == ("model", passed == 2, passed / 2)
     assert (document["passed"], document["applicable"]) == (passed, 2)
     assert "is no data folder of slrig serve" in shown.stderr
+
+
+def test_a_check_that_hangs_ends_the_job_and_leaves_the_checks_before_it_on_record(
+    hanging: type[Hangs], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(job, "run_checks", partial(run_checks, limit_s=0.2))
+    monkeypatch.setattr(managing, "Watchdog", partial(Watchdog, look_s=0.02))
+    data = DataFolder(tmp_path / "data")
+    database = Database(data.database)
+    rig = RigSession("model", Maker(hanging))
+    manager = JobManager(JobStore(database), data, rig, TameCompute(PIPELINE), ConformanceJob)
+    manager.start()
+    begun = manager.submit(ConformanceJob(PatternPlan()), wait=True)[0].id
+    record = manager.wait(begun, WAIT_S)
+    assert record.state is JobState.FAILED
+    assert record.fault is not None
+    assert "the rig: its driver has not come back from '" in record.fault.message
+    report = ConformanceReport.from_document(record.summary or {})
+    assert report.count(CheckOutcome.PASSED) > 0
+    assert report.stopped is not None
+    hung = report.stopped.split("'")[1]
+    assert next(each for each in report.results if each.outcome is CheckOutcome.NOT_RUN).title == hung
+    # Nobody else is given the rig as long as the call does not return.
+    with pytest.raises(DeviceError, match=f"come back from '{hung}'"):
+        manager.submit(ConformanceJob(PatternPlan()), wait=True)
+    hanging.released.set()
+    manager.close()
+    database.close()
+    data.release()
 
 
 def test_conform_on_a_rig_that_cannot_be_opened_is_exit_code_2(rig: Path) -> None:

@@ -407,7 +407,8 @@ def test_examination_is_kept_for_its_rig_and_replaced_by_the_next(tmp_path: Path
     assert kept is not None
     assert kept.found == found
     assert utc_now() - kept.at < timedelta(minutes=1)
-    assert [last_examination(tmp_path, "doctor", "other"), last_examination(tmp_path, "conform", "bench")] == [None] * 2
+    others = last_examination(tmp_path, "doctor", "other"), last_examination(tmp_path, "conformance", "bench")
+    assert others == (None, None)
 
 
 def test_no_examination_is_kept_where_no_service_keeps_its_data_and_no_other_file_is_taken_for_one(

@@ -21,9 +21,11 @@ from slrig.calibrate.verification import HealthStore, RigHealth, VerificationJob
 from slrig.combine.job import TURNTABLE, Models
 from slrig.combine.plan import ModelPlan, StatedAxis, TurntablePoses
 from slrig.combine.turntable import TurntableStore
+from slrig.doctor import DoctorJob
 from slrig.errors import DeviceGoneError, OutOfMemoryError, RigBusyError, ScanCancelledError, ScanInterruptedError
 from slrig.jobs.records import JobKind, JobRecord, JobState
 from slrig.rig.session import ActiveCalibration
+from slrig.scan.plan import PatternPlan
 from tests.unit.accept.test_plan import plan_of
 from tests.unit.calibrate.calibration_bench import BOARD, TameCalibrating, tame_calibration
 from tests.unit.calibrate.health_bench import a_verification
@@ -98,10 +100,11 @@ class Service(Bench):
 class Kind:
     """How jobs of a kind are begun and cancelled. Each object stands for one.
 
-    captures : its first part has the rig and takes frames. keeps : the frames stay where the second part failed.
+    captures : its first part has the rig and takes frames. computes : it has a second part. keeps : the frames stay
+    where that failed.
     """
 
-    captures, keeps = True, False
+    captures, computes, keeps = True, True, False
 
     def __init__(self, service: Service) -> None:
         self.service = service
@@ -218,7 +221,16 @@ class Position(Kind):
         self.service.acceptance.cancel(self.test)
 
 
-KINDS = (Scan, Pose, Solve, Verified, Model, Position)
+class Doctor(Kind):
+    """An examination of the rig, over when the rig is free."""
+
+    computes = False
+
+    def begin(self, *, wait: bool = False) -> UUID:
+        return self.service.manager.submit(DoctorJob(PatternPlan()), wait=wait)[0].id
+
+
+KINDS = (Scan, Pose, Solve, Verified, Model, Position, Doctor)
 
 
 @pytest.fixture
@@ -230,7 +242,7 @@ def service(tmp_path: Path) -> Iterator[Service]:
 
 @pytest.fixture
 def kind(request: pytest.FixtureRequest, service: Service) -> Kind:
-    """One of KINDS, by `every` or `capturing` below."""
+    """One of KINDS, by `computing` or `capturing` below."""
     return cast("type[Kind]", request.param)(service)
 
 
@@ -238,7 +250,7 @@ def parametrised(kinds: Sequence[type[Kind]]) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("kind", kinds, indirect=True, ids=[kind.__name__.lower() for kind in kinds])
 
 
-every = parametrised(KINDS)
+computing = parametrised([kind for kind in KINDS if kind.computes])
 capturing = parametrised([kind for kind in KINDS if kind.captures])
 
 
@@ -294,7 +306,7 @@ def test_a_job_that_is_cancelled_while_it_captures_leaves_nothing(service: Servi
     assert_well(service, kind)
 
 
-@every
+@computing
 def test_a_job_that_is_cancelled_while_it_computes_leaves_nothing(service: Service, kind: Kind) -> None:
     before = service.files()
     job_id = kind.computing()
@@ -322,7 +334,7 @@ def test_a_device_that_is_lost_fails_the_job_and_is_opened_again(service: Servic
     assert_well(service, kind, opened=2)
 
 
-@every
+@computing
 def test_mathematics_that_fails_fails_the_job_alone(service: Service, kind: Kind) -> None:
     service.computing.error = OutOfMemoryError("No room.")
     record = kind.over(kind.begin())

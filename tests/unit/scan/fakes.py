@@ -15,6 +15,8 @@ import numpy as np
 from slrig.bundle import write_bundle
 from slrig.capture.verifier import EvidenceSummary
 from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, DisplayedPattern, ProjectorInfo, Rig, Trigger
+from slrig.discovery import DiscoveredDevices
+from slrig.doctor import Diagnosis
 from slrig.errors import ScanCancelledError
 from slrig.jobs.compute import job_task
 from slrig.jobs.frame_feed import FrameSink
@@ -172,7 +174,21 @@ class TameBench:
     def captures(self) -> AbstractContextManager[None]:
         """Have every kind of job capture by `capture` within the block."""
         modules = ("scan.job", "calibrate.jobs", "calibrate.verification", "accept.running")
-        return stand_ins({f"{module}.capture_frames": self.capture for module in modules})
+        functions: dict[str, Callable[..., Any]] = {f"{module}.capture_frames": self.capture for module in modules}
+        functions["doctor.job.examine"] = self.examine
+        functions["doctor.job.discover_devices"] = lambda: DiscoveredDevices((), (), ())
+        return stand_ins(functions)
+
+    def examine(self, rig: Rig, *, progress: Callable[[str, float, str], None], **_: Any) -> Diagnosis:
+        """An examination that finds nothing but its rig."""
+        rig.projector.show(0)
+        self.began.set()
+        while not self.gate.wait(0.01):
+            progress("light", 0.5, "")
+        if self.error is not None:
+            error, self.error = self.error, None
+            raise error
+        return Diagnosis(rig.name, (), {}, None, None, 60.0, None, ())
 
     def open_rig(self) -> Rig:
         if self.open_error is not None:

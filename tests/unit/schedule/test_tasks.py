@@ -25,10 +25,9 @@ from slrig.errors import (
     SlrigError,
     SolveRefusedError,
 )
-from slrig.failure import JobFailure
+from slrig.failure import JobFailure, error_of
 from slrig.jobs.records import Holder, JobKind, JobState
 from slrig.schedule.records import Cron, RunState, Schedule, ScheduledRun, ScheduleSpec, TaskKind
-from slrig.schedule.rig_tasks import error_of
 from slrig.schedule.tasks import Tasks
 from tests.unit.accept.test_job import PLAN, Desk, desk, desks
 from tests.unit.calibrate.calibration_bench import CalibrationBench
