@@ -3,7 +3,7 @@
 | group | name of the entry | object |
 |---|---|---|
 | slrig.formats | any | a `FileFormat`: a file that is made of a finished scan on request |
-| slrig.receivers | X, with the setting `X_url` | `open(settings, outbox) -> slrig.schedule.sending.Sender` |
+| slrig.receivers | X, with the setting `X_url` | `open(settings, outbox) -> slrig.schedule.notices.Sender` |
 | slrig.observers | any | `observe()`, which returns None or an object with `ended(record, events)` and `close()` |
 
 Drivers have groups of their own: see `slrig.discovery`.
@@ -30,7 +30,7 @@ class FileFormat:
 
     name : of the file, such as "scan.mcap"; with "{camera}" there is one file for each camera. media_type : for HTTP.
     library : the module that the encoder needs. install : the command that installs it. encoder : "module:function".
-    With "{camera}" the function takes a `slrig.scan.organised.OrganisedCloud`; without, the calibration, an iterator of
+    With "{camera}" the function takes a `slrig.scan.clouds.OrganisedCloud`; without, the calibration, an iterator of
     such clouds, the first white image by camera, and the time of capture or None. It returns the file's bytes.
     """
 

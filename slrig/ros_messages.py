@@ -45,7 +45,7 @@ class Device(NamedTuple):
 
 
 class Points(Protocol):
-    """Points in the grid of a camera, (H, W), as `slrig.scan.organised.OrganisedCloud` and `slrig.client.Cloud`."""
+    """Points in the grid of a camera, (H, W), as `slrig.scan.clouds.OrganisedCloud` and `slrig.client.Cloud`."""
 
     @property
     def points_mm(self) -> NDArray[np.float32]: ...  # noqa: D102

@@ -28,7 +28,7 @@ _KEPT = {"SLRIG_SHARED", "SLRIG_GOLDEN", "SLRIG_FUZZ_FILES", "SLRIG_FUZZ_SEED", 
 
 NEED_KERNELS = (
     "tests/golden/", "tests/properties/", "tests/contract/", "tests/e2e/", "tests/unit/accept/",
-    "tests/unit/calibrate/", "tests/unit/calibration/", "tests/unit/combine/", "tests/unit/doctor/",
+    "tests/unit/calibrate/", "tests/unit/calibration/", "tests/unit/model_jobs/", "tests/unit/doctor/",
     "tests/unit/meshing/", "tests/unit/reconstruction/", "tests/unit/scan/", "tests/unit/simulated_rig/",
     "tests/unit/multiview/", "tests/unit/test_cli_calibrate.py", "tests/unit/test_cli_model.py",
     "tests/unit/test_cli_reconstruct.py", "tests/unit/test_colour_frames.py", "tests/unit/test_light_bound.py",

@@ -6,8 +6,7 @@ SLRIG_API_KEY=... python config/examples/several_views.py 8 model.ply
 
 import sys
 
-from slrig.client import Client
-from slrig.client.events import Progress
+from slrig.client import Client, Progress
 
 
 def main(views: int, output: str, axis: dict[str, list[float]] | None) -> None:

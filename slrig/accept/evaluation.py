@@ -1,29 +1,33 @@
-"""One capture of an artefact as figures: its points picked out of the scan, and the errors that they show."""
+"""Evaluation of an acceptance test: errors of one capture, their uncertainties, and the decision by all of them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator
 
-from slrig.accept.plan import AcceptancePlan, Artefact, Limits, Quantity, Step
+from slrig.accept.plan import REFERENCE_C, AcceptancePlan, Artefact, Artefacts, Limits, Quantity, Step
 from slrig.calibration import (
     ArtefactPoints,
+    Decision,
     FittedPlane,
     FittedSphere,
+    decide,
     dispersion_mm,
     find_balls,
     find_plane,
     fit_plane,
     fit_sphere,
 )
-from slrig.errors import NothingToReconstructError
-from slrig.model import FloatArray, Mesh
+from slrig.calibration.judgement import MIN_SCALE_ERROR, SCALE_SIGMAS
+from slrig.errors import NothingToReconstructError, setting
+from slrig.model import Calibration, FloatArray, Mesh
 
 Measured = Annotated[float, BeforeValidator(lambda given: math.nan if given is None else given)]
 """A number that may be NaN, for which JSON holds null."""
@@ -141,3 +145,179 @@ def _errors_mm(fits: Sequence[FittedSphere | FittedPlane], plan: AcceptancePlan)
             }
     apart_mm = float(np.linalg.norm(fits[0].centre_mm - fits[1].centre_mm))
     return {Quantity.SPACING: apart_mm - plan.artefacts.expanded_mm(plan.artefacts.distance)}
+
+
+FORMULA = "U = sqrt(U_certificate^2 + U_form^2 + U_temperature^2 + U_fixture^2)"
+_HALF_TO_DEVIATION = 1 / math.sqrt(3)  # of a rectangular distribution
+_EXPANSION_WITHIN_PER_K = 1.0e-6
+"""Steels differ by so much (ISO 3650); other materials are taken to be known no better."""
+_TOLD_WITHIN_K = 1.0
+"""Chosen: a room's thermometer, and an artefact that has not quite taken the room's temperature."""
+_ROOM_WITHIN_K = 5.0
+"""Chosen: a room whose temperature nobody read, about the reference of 20 °C."""
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorUncertainty:
+    """Expanded uncertainties (k = 2) of an error, mm, by cause; None where the certificate's was not told."""
+
+    certificate_mm: float | None
+    form_mm: float | None
+    temperature_mm: float
+    fixture_mm: float
+
+    @property
+    def expanded_mm(self) -> float:
+        """U by `FORMULA`; what was not told is left out."""
+        return math.hypot(self.certificate_mm or 0.0, self.form_mm or 0.0, self.temperature_mm, self.fixture_mm)
+
+
+def error_uncertainty(quantity: Quantity, artefacts: Artefacts) -> ErrorUncertainty:
+    """What the artefact of a quantity brings into its error.
+
+    An artefact out of form by F has u = F / 2 (ISO/TS 23165), with k = 2 F itself; a sphere's diameter found from the
+    part that is seen may differ from the certified one by as much. A length L of thermal expansion a at a temperature t
+    has u^2 = (L a u(t))^2 + (L (t - 20 °C) u(a))^2.
+    """
+    certified = {Quantity.SIZE: artefacts.diameter, Quantity.SPACING: artefacts.distance}.get(quantity)
+    form_mm: float | None = 0.0
+    if quantity in {Quantity.FORM, Quantity.SIZE}:
+        form_mm = artefacts.sphere_form_mm
+    elif quantity is Quantity.FLATNESS:
+        form_mm = artefacts.plane_form_mm
+    return ErrorUncertainty(
+        certificate_mm=0.0 if certified is None else certified.uncertainty_mm,
+        form_mm=form_mm,
+        temperature_mm=0.0 if certified is None else _temperature_mm(certified.value_mm, artefacts),
+        fixture_mm=artefacts.fixture_mm,
+    )
+
+
+def _temperature_mm(length_mm: float, artefacts: Artefacts) -> float:
+    if artefacts.expansion_per_k == 0:
+        return 0.0
+    told = artefacts.temperature_c is not None
+    warmer_k = 0.0 if artefacts.temperature_c is None else artefacts.temperature_c - REFERENCE_C
+    by_temperature = artefacts.expansion_per_k * (_TOLD_WITHIN_K if told else _ROOM_WITHIN_K)
+    by_expansion = warmer_k * _EXPANSION_WITHIN_PER_K
+    return 2 * length_mm * math.hypot(by_temperature, by_expansion) * _HALF_TO_DEVIATION
+
+
+_FEWEST_PLACES = 3
+"""Chosen: in fewer, a volume that is bent cannot be told from one that is too large."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """share : by how much a bar measures longer than its certificate says, over its length, the mean of all places.
+
+    sigma : of that, from how places differ and what is known of the bar; places : where it was measured. words : what
+    is wrong, and what to do; None where nothing is.
+    """
+
+    share: float
+    sigma: float
+    places: int
+    words: str | None
+
+
+def scale_by_bar(readings: Sequence[Reading], artefacts: Artefacts) -> Scale | None:
+    """The scale that the bar's readings show; None where the bar was measured in fewer than three places.
+
+    It is told from 0.1 % and from five of its standard deviations on, as the scale of a calibration is.
+    """
+    by_place = errors_by_step(readings, Quantity.SPACING)
+    if len(by_place) < _FEWEST_PLACES:
+        return None
+    length_mm = artefacts.expanded_mm(artefacts.distance)
+    shares = np.array([np.mean(errors) for errors in by_place.values()]) / length_mm
+    share = float(shares.mean())
+    known = error_uncertainty(Quantity.SPACING, artefacts).expanded_mm / 2 / length_mm
+    sigma = float(np.hypot(shares.std(ddof=1) / np.sqrt(len(shares)), known))
+    if abs(share) <= max(MIN_SCALE_ERROR, SCALE_SIGMAS * sigma):
+        return Scale(share, sigma, len(shares), None)
+    longer, smaller = ("longer", "smaller") if share > 0 else ("shorter", "larger")
+    words = (
+        f"the bar measures {abs(share):.2%} ± {100 * sigma:.1g}% {longer} than its certificate says, in all of "
+        f"{len(shares)} places: everything does. The squares of the board that the rig was calibrated with are so much "
+        f"{smaller} than they were said to be, or a device was moved since; measure both rulers of the board, give "
+        f"{setting('measured_mm')}, and calibrate again"
+    )
+    return Scale(share, sigma, len(shares), words)
+
+
+@dataclass(frozen=True, slots=True)
+class QuantityVerdict:
+    """One quantity over all positions. error_mm : of the reading with the largest, which is that of `step`, `take`.
+    scatter_mm : the standard deviation of repeated captures, NaN where none were made; repeats : captures that tell it.
+    It is told and decides nothing: the rig's own scatter is in its errors.
+    """
+
+    quantity: Quantity
+    error_mm: float
+    limit_mm: float
+    step: str
+    take: int
+    uncertainty: ErrorUncertainty
+    scatter_mm: float
+    repeats: int
+    decision: Decision
+
+
+@dataclass(frozen=True, slots=True)
+class AcceptanceResult:
+    """A test that was done. readings : every capture in order. verdicts : by quantity."""
+
+    rig: str
+    begun: datetime
+    ended: datetime
+    plan: AcceptancePlan
+    calibration: Calibration
+    readings: tuple[Reading, ...]
+    verdicts: tuple[QuantityVerdict, ...]
+
+    @property
+    def decision(self) -> Decision:
+        """Fails if any quantity fails, passes if all pass."""
+        told = {verdict.decision for verdict in self.verdicts}
+        for worst in (Decision.FAILS, Decision.UNDECIDED):
+            if worst in told:
+                return worst
+        return Decision.PASSES
+
+    @property
+    def scale(self) -> Scale | None:
+        """Whether everything measures too long or too short; None where the bar was not measured, or in few places."""
+        return scale_by_bar(self.readings, self.plan.artefacts)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every position was measured as often as planned."""
+        return len(self.readings) == len(self.plan.takes)
+
+
+def verdicts(readings: Sequence[Reading], plan: AcceptancePlan) -> tuple[QuantityVerdict, ...]:
+    """What is decided of each quantity that was measured."""
+    told = {quantity for each in readings for quantity in each.errors_mm}
+    return tuple(_verdict(quantity, readings, plan) for quantity in Quantity if quantity in told)
+
+
+def _verdict(quantity: Quantity, readings: Sequence[Reading], plan: AcceptancePlan) -> QuantityVerdict:
+    having = [each for each in readings if quantity in each.errors_mm]
+    worst = max(having, key=lambda each: abs(each.errors_mm[quantity]))
+    error, limit = worst.errors_mm[quantity], plan.limits.limit_mm(quantity)
+    uncertainty = error_uncertainty(quantity, plan.artefacts)
+    return QuantityVerdict(
+        quantity, error, limit, worst.step, worst.take, uncertainty, *_scatter(quantity, having),
+        decide(error, limit, uncertainty.expanded_mm),
+    )  # fmt: skip
+
+
+def _scatter(quantity: Quantity, readings: Sequence[Reading]) -> tuple[float, int]:
+    """Standard deviation of repeated captures of one position, mm, and how many they were; NaN and 0 without any."""
+    repeated = [np.array(errors) for errors in errors_by_step(readings, quantity).values() if len(errors) > 1]
+    if not repeated:
+        return float("nan"), 0
+    count = sum(len(errors) for errors in repeated)
+    squares = sum(float(((errors - errors.mean()) ** 2).sum()) for errors in repeated)
+    return float(np.sqrt(squares / (count - len(repeated)))), count

@@ -1,4 +1,4 @@
-"""Acceptance tests on a running service: opened, measured position by position or by script, and kept. No HTTP here."""
+"""Acceptance tests on a rig: opened, measured position by position or by script, evaluated and kept. No HTTP here."""
 
 from __future__ import annotations
 
@@ -7,17 +7,27 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, ClassVar
 from uuid import UUID, uuid4
 
-from slrig.accept import running
-from slrig.accept.evaluation import Reading
-from slrig.accept.plan import AcceptancePlan, takes_of
-from slrig.accept.records import AcceptanceRecord, AcceptanceState, with_jobs
-from slrig.accept.running import bundle_name, by_positioner, capture_take, required_calibration
-from slrig.accept.store import READINGS, AcceptanceStore, read_test, readings_json
-from slrig.accept.verdicts import AcceptanceResult, verdicts
+import numpy as np
+
+from slrig.accept.evaluation import AcceptanceResult, Reading, reading, verdicts
+from slrig.accept.plan import AcceptancePlan, Artefact, Step, takes_of, turn_deg
+from slrig.accept.store import (
+    READINGS,
+    AcceptanceRecord,
+    AcceptanceState,
+    AcceptanceStore,
+    keep_points,
+    read_test,
+    readings_json,
+    with_jobs,
+)
 from slrig.bundle import CALIBRATION, read_calibration, write_calibration, write_file
+from slrig.config import HeadTable, RigConfig
+from slrig.devices import Rig
 from slrig.disk import storage_errors
 from slrig.errors import (
     ArtefactNotReadyError,
@@ -28,16 +38,144 @@ from slrig.errors import (
     JobNotFoundError,
     ScanCancelledError,
     ScanStateError,
+    UnsupportedByDeviceError,
+    setting,
 )
 from slrig.jobs.data_folder import BUNDLE, DataFolder
 from slrig.jobs.job import Job, JobRun, Outcome
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import Clock, Holder, JobKind, JobRecord, utc_now
-from slrig.jobs.worker_process import Task
-from slrig.model import Calibration
+from slrig.jobs.worker import Task
+from slrig.model import Calibration, FloatArray
 from slrig.rig.session import RigSession
-from slrig.scan.plan import ProgressCallback, ScanPlan
-from slrig.scan.plan_check import check_plan
+from slrig.scan.acquisition import capture_frames
+from slrig.scan.artefacts import MESH, decode_mesh_ply
+from slrig.scan.plan import ProgressCallback, ReconstructionPlan, ScanPlan, check_plan
+
+
+def bundle_name(step: Step, take: int) -> str:
+    """The folder of a capture's frames."""
+    return f"{step.name}-{take + 1}"
+
+
+def capture_take(
+    rig: Rig, plan: AcceptancePlan, bundle: Path, *, progress: ProgressCallback, cancelled: Callable[[], bool]
+) -> None:
+    """Record a bundle of the artefact that stands before the rig. Raises CalibrationError, and as a scan."""
+    calibration = required_calibration(rig)
+    # The test must not use what a rendered rig knows of its scene; and the noise of a point, stated next to its form,
+    # leaves out the calibration's own error, which the form shows.
+    blind = replace(rig, head=None, calibration=replace(calibration, solved=None))
+    scan = ScanPlan(exposure_s=plan.exposure_s)
+    capture_frames(blind, scan, bundle, progress=progress, cancelled=cancelled).finish()
+
+
+def evaluated(
+    bundle: Path,
+    folder: Path,
+    plan: AcceptancePlan,
+    step: Step,
+    take: int,
+    /,
+    *,
+    progress: ProgressCallback,
+    cancelled: Callable[[], bool],
+) -> Reading:
+    """Reconstruct a bundle, measure the artefact in its mesh, and keep its points in `folder`."""
+    # The process that owns the rig loads the mathematics only if it has to do it itself.
+    from slrig.scan.reconstruct import reconstruct_bundle
+
+    with TemporaryDirectory(dir=bundle.parent, prefix=".mesh-") as scratch:
+        made = Path(scratch) / "mesh"
+        reconstruct_bundle(bundle, made, plan=ReconstructionPlan(), progress=progress, cancelled=cancelled)
+        with storage_errors(made):
+            mesh = decode_mesh_ply((made / MESH).read_bytes())
+    found, evidence = reading(mesh, step, take, plan)
+    keep_points(evidence, folder, step.name, take)
+    return found
+
+
+def move_artefact(rig: Rig, plan: AcceptancePlan, step: Step) -> None:
+    """Have the rig's positioner bring the artefact of a step to its place: its poses are called as the steps are.
+    Raises UnsupportedByDeviceError if it does not know a position of the plan.
+    """
+    poses = () if rig.positioner is None else tuple(rig.positioner.poses)
+    missing = [each.name for each in plan.steps if each.name not in poses]
+    if missing or rig.positioner is None:
+        has = f"a positioner with {', '.join(poses)}" if poses else "no positioner"
+        message = (
+            f"rig '{rig.name}' has {has}, and the test needs the positions {', '.join(missing)}; place the artefacts "
+            f"by hand (without {setting('scripted')}), or name the positioner's poses so"
+        )
+        raise UnsupportedByDeviceError(message)
+    rig.positioner.move(poses.index(step.name))
+
+
+def required_calibration(rig: Rig) -> Calibration:
+    """The rig's calibration. Raises CalibrationError if it has none."""
+    if rig.calibration is None:
+        message = f"rig '{rig.name}' has no calibration, and nothing can be measured; calibrate it first"
+        raise CalibrationError(message)
+    return rig.calibration
+
+
+SCENE = "acceptance-scene.toml"
+_ALBEDO = 0.8
+_BAR_SHARE = 0.25  # of a ball's radius: the rod between them
+_ASIDE = 20.0  # diagonals of the volume: where artefacts stand that are not measured
+
+
+def scripted_config(config: RigConfig, plan: AcceptancePlan, folder: Path) -> RigConfig:
+    """The rig with the artefacts in place of its scene, which is written into `folder`, and a pose for every position.
+
+    Raises UnsupportedByDeviceError if the rig's head has no scene, for it is not rendered then; StorageError.
+    """
+    if config.head is None or "scene" not in config.head.options:
+        message = (
+            f"rig '{config.name}' is not rendered and nobody moves its artefacts by script; leave "
+            f"{setting('scripted')} out and place them by hand"
+        )
+        raise UnsupportedByDeviceError(message)
+    path = (folder / SCENE).resolve()
+    with storage_errors(path):
+        folder.mkdir(parents=True, exist_ok=True)
+    write_file(path, scene_text(plan).encode())
+    # A series of poses of a board that is not there any more would be refused.
+    options = {key: value for key, value in config.head.model_dump().items() if key != "poses"}
+    options |= {"scene": str(path), "pose": [_pose(step) for step in plan.steps]}
+    return replace(config, head=HeadTable.model_validate(options))
+
+
+def scene_text(plan: AcceptancePlan) -> str:
+    """The scene file, in TOML: a sphere, a ball bar and a plane, each out of sight until a pose brings it."""
+    artefacts = plan.artefacts
+    aside = plan.volume_mm.mean(axis=0) + np.array([_ASIDE * plan.diagonal_mm, 0.0, 0.0])
+    apart = np.array([0.0, 2 * plan.diagonal_mm, 0.0])
+    radius = artefacts.ball_mm / 2
+    objects = [
+        _object(Artefact.SPHERE, "sphere", aside, f"radius_mm = {artefacts.diameter.value_mm / 2!r}"),
+        _object(
+            Artefact.BAR, "ball_bar", aside + apart,
+            f"radius_mm = {radius!r}\ndistance_mm = {artefacts.distance.value_mm!r}\n"
+            f"bar_radius_mm = {_BAR_SHARE * radius!r}",
+        ),
+        _object(Artefact.PLANE, "plane", aside - apart, f"size_mm = {[float(each) for each in artefacts.plane_mm]}"),
+    ]  # fmt: skip
+    return "\n\n".join(['name = "acceptance"', *objects]) + "\n"
+
+
+def _object(artefact: Artefact, shape: str, position: FloatArray, rest: str) -> str:
+    place = [round(float(each), 3) for each in position]
+    return f'[[object]]\nname = "{artefact}"\nshape = "{shape}"\nposition_mm = {place}\nalbedo = {_ALBEDO}\n{rest}'
+
+
+def _pose(step: Step) -> dict[str, object]:
+    return {
+        "name": step.name,
+        "object": str(step.artefact),
+        "position_mm": [float(each) for each in step.centre_mm],
+        "rotation_deg": list(turn_deg(step)),
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +222,7 @@ class PositionJob(Job):
         takes = takes_of(plan, self.step)
         if self.scripted:
             run.report(f"{self.step}: place", 0.0, takes[0][0].words)
-            by_positioner(opened, plan)(opened, takes[0][0])
+            move_artefact(opened, plan, takes[0][0])
         with storage_errors(run.recording):
             run.recording.mkdir()
         for step, take in takes:
@@ -102,7 +240,7 @@ class PositionJob(Job):
         plan = read_test(_test_of(run)).plan
         takes, readings = takes_of(plan, self.step), list[Reading]()
         for step, take in takes:
-            found = running.evaluated(
+            found = evaluated(
                 run.bundle / bundle_name(step, take), run.folder, plan, step, take,
                 progress=self._progress(run, take, len(takes)), cancelled=run.cancelled,
             )  # fmt: skip
@@ -253,6 +391,19 @@ class AcceptanceTests:
             raise ArtefactNotReadyError(message)
         return path
 
+    def result(self, test_id: UUID) -> AcceptanceResult:
+        """The result of a test of which every position is measured. Raises JobNotFoundError, StorageError."""
+        record = self._found(test_id)
+        calibration = read_calibration(self._store.folder(test_id) / CALIBRATION)
+        return AcceptanceResult(
+            record.rig, record.created_at, self._clock(), record.plan, calibration, record.readings,
+            verdicts(record.readings, record.plan),
+        )  # fmt: skip
+
+    def folder(self, test_id: UUID) -> Path:
+        """Where reports and points of a test lie."""
+        return self._store.folder(test_id)
+
     def _found(self, test_id: UUID) -> AcceptanceRecord:
         """A test as it is on disk."""
         with self._lock:
@@ -296,11 +447,7 @@ class AcceptanceTests:
 
     def _conclude(self, record: AcceptanceRecord) -> None:
         """Decide, and write the reports: every position is measured."""
-        calibration = read_calibration(self._store.folder(record.id) / CALIBRATION)
-        result = AcceptanceResult(
-            record.rig, record.created_at, self._clock(), record.plan, calibration, record.readings,
-            verdicts(record.readings, record.plan),
-        )  # fmt: skip
+        result = self.result(record.id)
         given = (result, self._store.folder(record.id))
         self._manager.worker.run(Task(write_test_report, given, what="report of the acceptance test"))
         self._change(record.id, state=AcceptanceState.FINISHED, decision=result.decision)

@@ -11,17 +11,13 @@ import numpy as np
 from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
-from slrig.accept.evaluation import Reading, ReadingPoints
-from slrig.accept.plan import AcceptancePlan, Artefact, Step
-from slrig.accept.scene import turn_deg
+from slrig.accept.evaluation import FORMULA, AcceptanceResult, Reading, ReadingPoints
+from slrig.accept.plan import AcceptancePlan, Artefact, Step, turn_deg
 from slrig.accept.store import HTML, JSON, kept_points, points_file
-from slrig.accept.uncertainty import FORMULA
-from slrig.accept.verdicts import AcceptanceResult
 from slrig.bundle import write_file
 from slrig.calibration import MAX_REJECTED_FRACTION
 from slrig.model import FloatArray, Pinhole, Pixels
-from slrig.reports.drawing import WIDTH, drawing, legend, path, polygon, ramp, shape
-from slrig.reports.page import filled, jpeg_uri
+from slrig.reports.page import WIDTH, drawing, filled, jpeg_uri, legend, path, polygon, ramp, shape
 from slrig.scan.artefacts import write_report
 
 FORMAT = "slrig-acceptance"

@@ -1,6 +1,6 @@
-"""Acceptance tests on disk, each a folder.
+"""Acceptance tests as values, and on disk, each a folder.
 
-DATA/acceptance/ID/test.json   what is on record of it
+DATA/acceptance/ID/test.json   its record
 DATA/acceptance/ID/positions/POSITION/   a position that was measured: readings.json, and CAPTURE.npz, the points
 DATA/acceptance/ID/report.html, report.json   when every position is measured; the second is written last
 """
@@ -11,7 +11,9 @@ import json
 import shutil
 import uuid
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from datetime import datetime
+from enum import StrEnum
 from io import BytesIO
 from pathlib import Path
 from uuid import UUID
@@ -21,16 +23,117 @@ import structlog
 from pydantic import TypeAdapter
 
 from slrig.accept.evaluation import Reading, ReadingPoints
-from slrig.accept.records import AcceptanceRecord, AcceptanceState, record_from_json, record_json
+from slrig.accept.plan import AcceptancePlan, Step
 from slrig.bundle import write_file
-from slrig.calibrate.records import plain
+from slrig.calibrate.store import plain
 from slrig.calibration import Decision
 from slrig.disk import storage_errors
 from slrig.errors import StorageError
-from slrig.failure import disk_errors
+from slrig.failure import JobFailure, disk_errors
 from slrig.jobs.data_folder import DataFolder, remove
+from slrig.jobs.records import JobProgress, JobRecord, JobState
+
+_FORMAT = "slrig-acceptance-test"
+
+
+class AcceptanceState(StrEnum):
+    """How far a test is.
+
+    OPEN waits for its next position. INTERRUPTED was cut off by the end of the service while it was measured, and goes
+    on, like an open one, when its next position is measured.
+    """
+
+    OPEN = "open"
+    MEASURING = "measuring"
+    INTERRUPTED = "interrupted"
+    FINISHED = "finished"
+    CANCELLED = "cancelled"
+
+    @property
+    def waiting(self) -> bool:
+        """True while the next position may be measured."""
+        return self in {AcceptanceState.OPEN, AcceptanceState.INTERRUPTED}
+
+
+@dataclass(frozen=True, slots=True)
+class AcceptanceRecord:
+    """One test.
+
+    number : rises with every test and orders lists. calibration : id of the one that it is done with. readings : of
+    every capture so far, in the order of the plan. state : on disk OPEN, FINISHED or CANCELLED. decision : None before
+    the end.
+
+    The last two are of its jobs, and not on disk. fault : why the last position was not measured, None where it was; it
+    may be measured again. progress : of what is under way.
+    """
+
+    number: int
+    id: UUID
+    created_at: datetime
+    rig: str
+    calibration: str
+    plan: AcceptancePlan
+    state: AcceptanceState = AcceptanceState.OPEN
+    readings: tuple[Reading, ...] = ()
+    decision: Decision | None = None
+    fault: JobFailure | None = None
+    progress: JobProgress | None = None
+
+    @property
+    def next_take(self) -> tuple[Step, int] | None:
+        """The position to measure next, and how many times it was measured before; None when all are."""
+        takes = self.plan.takes
+        return takes[len(self.readings)] if len(self.readings) < len(takes) else None
+
+    def from_first_take(self) -> AcceptanceRecord:
+        """The record without the captures of a position that was not captured as often as planned.
+
+        Between repeats nothing may be moved, and who knows what was since: the position begins anew.
+        """
+        following = self.next_take
+        return self if following is None else replace(self, readings=self.readings[: len(self.readings) - following[1]])
+
+
+_AFTER = {JobState.INTERRUPTED: AcceptanceState.INTERRUPTED, JobState.CANCELLED: AcceptanceState.CANCELLED}
+"""What a test is when its newest job ended so."""
+
+
+def with_jobs(record: AcceptanceRecord, jobs: Sequence[JobRecord]) -> AcceptanceRecord:
+    """A test as it is on disk, completed by what its jobs, oldest first, say."""
+    if not record.state.waiting or not jobs:
+        return record
+    job = jobs[-1]
+    if not job.state.final:
+        return replace(record, state=AcceptanceState.MEASURING, progress=job.progress)
+    return replace(record, state=_AFTER.get(job.state, record.state), fault=job.fault)
+
+
+_records = TypeAdapter(AcceptanceRecord)
+
+
+def record_json(record: AcceptanceRecord) -> bytes:
+    """A record as JSON text, without what its jobs say."""
+    document = {"format": _FORMAT, "version": 3, **plain(record), "created_at": record.created_at.isoformat()}
+    del document["progress"], document["fault"]
+    return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
+
+
+def record_from_json(text: bytes, source: str) -> AcceptanceRecord:
+    """The inverse of `record_json`. Raises StorageError when it is not that."""
+    try:
+        found = json.loads(text)
+        if found["format"] != _FORMAT:
+            raise KeyError(found["format"])  # noqa: TRY301 - told with the other faults of the file
+        return _records.validate_python(found)
+    except (ValueError, KeyError, TypeError) as error:
+        message = f"{source} is not an acceptance test as this version of slrig writes it: {error!r}"
+        raise StorageError(message) from error
+
 
 RECORD, HTML, JSON = "test.json", "report.html", "report.json"
+POSITIONS = "positions"
+"""Below the folder of a test: a folder of each position that was measured."""
+
 READINGS = "readings.json"
 """In the folder of a position: what was measured in each capture."""
 
@@ -78,7 +181,7 @@ class AcceptanceStore:
 
     def readings(self, test_id: UUID, step: str) -> list[Reading]:
         """What was measured in a position. Raises StorageError."""
-        path = self.folder(test_id) / "positions" / step / READINGS
+        path = self.folder(test_id) / POSITIONS / step / READINGS
         with disk_errors(path):
             return _readings.validate_json(path.read_bytes())
 
@@ -86,7 +189,7 @@ class AcceptanceStore:
         """Put a test on record in place of what it was. Raises StorageError."""
         place = self.folder(record.id)
         with disk_errors(place):
-            (place / "positions").mkdir(parents=True, exist_ok=True)
+            (place / POSITIONS).mkdir(parents=True, exist_ok=True)
         write_file(place / RECORD, record_json(record))
 
     def delete(self, test_id: UUID) -> None:
@@ -122,7 +225,7 @@ def points_file(step: str, take: int) -> str:
     >>> points_file("sphere-1", 0)
     'positions/sphere-1/1.npz'
     """
-    return f"positions/{step}/{take + 1}.npz"
+    return f"{POSITIONS}/{step}/{take + 1}.npz"
 
 
 def keep_points(evidence: ReadingPoints, folder: Path, step: str, take: int) -> None:

@@ -3,7 +3,7 @@
 import sys
 
 from slrig.api.app import bare_app
-from slrig.api.openapi import text
+from slrig.api.problems import text
 
 if __name__ == "__main__":
     sys.stdout.write(text(bare_app()))

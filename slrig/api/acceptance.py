@@ -11,14 +11,11 @@ from fastapi import APIRouter, Body, Query, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, Field
 
-from slrig.accept.asking import AcceptanceRequest
-from slrig.accept.plan import Quantity
-from slrig.accept.records import AcceptanceRecord, AcceptanceState
-from slrig.accept.store import HTML, JSON
-from slrig.api.idempotency import IdempotencyKey, once, started_once
-from slrig.api.openapi import file_of, problems
+from slrig.accept.plan import AcceptanceRequest, Quantity
+from slrig.accept.store import HTML, JSON, AcceptanceRecord, AcceptanceState
+from slrig.api.problems import file_of, problems
 from slrig.api.schemas import AnyFault, filled
-from slrig.api.service import Serving
+from slrig.api.service import IdempotencyKey, Serving, once, started_once
 from slrig.bundle import Strict
 from slrig.calibration import Decision
 

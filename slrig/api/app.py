@@ -1,48 +1,102 @@
-"""The application: routers, and round them what every request passes."""
+"""The application: its routers, the middleware around them, and the documentation page."""
 
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import AsyncIterator
+import re
+from collections.abc import AsyncIterator, Iterable, Sequence
 from contextlib import asynccontextmanager
+from importlib.util import find_spec
+from pathlib import Path
 
-from fastapi import FastAPI
+from fastapi import APIRouter, FastAPI, Response
 from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import FileResponse
+from fastapi.routing import iter_route_contexts
+from starlette.exceptions import HTTPException
 from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.routing import BaseRoute
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from slrig.api import (
-    acceptance,
-    artefacts,
-    audit,
-    calibration,
-    docs,
-    events,
-    examinations,
-    exposure,
-    fleet,
-    health,
-    model_shooting,
-    models,
-    page,
-    presets,
-    rig,
-    scans,
-    schedules,
-    sessions,
-    system,
-    turntable,
-)
-from slrig.api.access import Access
+from slrig.api import acceptance, auth, calibration, events, files, models, rig, scans, schedules, system
+from slrig.api.auth import LOCAL_NAMES, Access, BodyLimits, KeyRing, SecurityHeaders, Sessions
 from slrig.api.calibration import IMPORT_PATH, MOST_IMPORT_BYTES
 from slrig.api.events import OpenStreams
-from slrig.api.keys import KeyRing
-from slrig.api.latency import Latency
-from slrig.api.methods import Methods
-from slrig.api.openapi import describe
-from slrig.api.problems import PlainErrorsToProblems, install_problems
-from slrig.api.security import LOCAL_NAMES, BodyLimits, SecurityHeaders
-from slrig.api.service import Service
-from slrig.api.sessions import Sessions
+from slrig.api.problems import PlainErrorsToProblems, answer, describe, install_problems, problem
+from slrig.api.service import Latency, Service
+
+_STREAMS = ("text/event-stream", "multipart/x-mixed-replace")
+"""Answers that last: GET opens a stream, and light may move for it. HEAD is refused there."""
+
+
+class Methods:
+    """Middleware that refuses the methods that a path has not, and answers HEAD with the head of what GET would say.
+
+    FastAPI names the method of one route where several share a path, and takes `/calibration/import` for a calibration
+    of that name wherever the method is not its own.
+    """
+
+    def __init__(self, app: ASGIApp, *, routes: Sequence[BaseRoute]) -> None:
+        self._app = app
+        self._fixed: dict[str, set[str]] = {}
+        self._patterns: dict[str, tuple[re.Pattern[str], set[str]]] = {}
+        for route in iter_route_contexts(routes):
+            path, methods = route.path_format or "", set(route.methods or ())
+            if "GET" in methods and not _streams(getattr(route, "responses", {})):
+                methods.add("HEAD")
+            if "{" in path:
+                self._patterns.setdefault(path, (route.path_regex, set()))[1].update(methods)
+            else:
+                self._fixed.setdefault(path, set()).update(methods)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request, or refuse it."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        method, allowed = scope["method"], self._methods(scope["path"])
+        if allowed and method not in allowed:
+            listed = ", ".join(sorted(allowed))
+            detail = (
+                f"{scope['path']} takes {listed}, and the request is a {method}. /openapi.json says what each does."
+            )
+            refusal = answer(problem(405, "method-not-allowed", detail), headers={"Allow": listed})
+            await refusal(scope, receive, send)
+        elif method == "HEAD":
+            asked = {**scope, "method": "GET"}
+            try:
+                await self._app(asked, receive, _head_only(asked, scope, send))
+            except _HeadSentError:
+                return
+        else:
+            await self._app(scope, receive, send)
+
+    def _methods(self, path: str) -> set[str]:
+        """Those of a path; none where there is nothing at it."""
+        if path in self._fixed:
+            return self._fixed[path]
+        return {each for pattern, methods in self._patterns.values() if pattern.match(path) for each in methods}
+
+
+class _HeadSentError(Exception):
+    """Ends the making of an answer of which only the head was asked for."""
+
+
+def _head_only(asked: Scope, scope: Scope, send: Send) -> Send:
+    async def head(message: Message) -> None:
+        # Whoever measures outside of this looks for it there.
+        scope["route"] = asked.get("route")
+        await send(message)
+        await send({"type": "http.response.body"})
+        raise _HeadSentError
+
+    return head
+
+
+def _streams(responses: dict[int | str, dict[str, Iterable[str]]]) -> bool:
+    answered = responses.get(200, {}).get("content", ())
+    return any(kind.startswith(_STREAMS) for kind in answered)
+
 
 _TITLE = "slrig"
 _SUMMARY = "Structured-light scans over HTTP: from POST /scan to a triangle mesh in millimetres"
@@ -61,29 +115,26 @@ def bare_app() -> FastAPI:
         lifespan=_life,
     )
     for part in (
-        scans,
-        events,
-        artefacts,
-        models,
-        model_shooting,
-        presets,
-        exposure,
-        rig,
-        examinations,
-        calibration,
-        health,
-        turntable,
-        acceptance,
-        schedules,
-        sessions,
-        audit,
-        fleet,
-        system,
-        docs,
-        page,
+        scans.router,
+        events.router,
+        files.router,
+        models.router,
+        scans.preset_router,
+        scans.exposure_router,
+        rig.router,
+        rig.examination_router,
+        calibration.router,
+        rig.health_router,
+        rig.turntable_router,
+        acceptance.router,
+        schedules.router,
+        auth.router,
+        system.router,
+        router,
+        system.page_router,
     ):
-        app.include_router(part.router)
-    app.mount(page.FILES_PATH, page.page_files())
+        app.include_router(part)
+    app.mount(system.FILES_PATH, system.page_files())
     app.openapi = lambda: describe(app)  # type: ignore[method-assign] # the way that FastAPI documents
     install_problems(app)
     app.add_middleware(Methods, routes=app.routes)
@@ -127,3 +178,45 @@ async def _life(app: FastAPI) -> AsyncIterator[None]:
         yield
     finally:
         await run_in_threadpool(service.close)
+
+
+_ASSETS = {"swagger-ui-bundle.js": "text/javascript", "swagger-ui.css": "text/css", "favicon.png": "image/png"}
+_START = """SwaggerUIBundle({
+  url: "/openapi.json", dom_id: "#docs", deepLinking: true, validatorUrl: null,
+  presets: [SwaggerUIBundle.presets.apis], layout: "BaseLayout",
+});
+"""
+_PAGE = """<!doctype html>
+<html lang="en">
+<head>
+  <meta charset="utf-8"><title>slrig: the interface</title>
+  <link rel="icon" href="/docs/favicon.png"><link rel="stylesheet" href="/docs/swagger-ui.css">
+</head>
+<body><div id="docs"></div>
+  <script src="/docs/swagger-ui-bundle.js"></script><script src="/docs/start.js"></script>
+</body>
+</html>
+"""
+
+router = APIRouter(prefix="/docs", include_in_schema=False)
+
+
+@router.get("")
+def show_interface() -> Response:
+    """Show the description of the interface as a page."""
+    return Response(_PAGE, media_type="text/html")
+
+
+@router.get("/start.js")
+def start_page() -> Response:
+    """What the page does at its start, in a file of its own: scripts within the page are forbidden."""
+    return Response(_START, media_type="text/javascript")
+
+
+@router.get("/{name}")
+def fetch_asset(name: str) -> Response:
+    """Return a part of Swagger UI."""
+    found = find_spec("fastapi_offline")
+    if name not in _ASSETS or found is None or found.origin is None:
+        raise HTTPException(404)
+    return FileResponse(Path(found.origin).parent / "static" / name, media_type=_ASSETS[name])

@@ -15,15 +15,13 @@ from fastapi.concurrency import run_in_threadpool
 from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.exceptions import HTTPException
 
-from slrig.api.openapi import problems
-from slrig.api.problems import fault_problem
+from slrig.api.problems import fault_problem, problems
 from slrig.api.service import Serving
-from slrig.calibrate.records import SessionState
-from slrig.calibrate.register import CalibrationRegister
+from slrig.calibrate.store import CalibrationRegister, SessionState
 from slrig.config import ServiceSettings
+from slrig.doctor import EXAMINATIONS
 from slrig.errors import CalibrationNotFoundError, JobNotFoundError
 from slrig.failure import JobFailure
-from slrig.jobs.examinations import EXAMINATIONS
 from slrig.jobs.records import JobEvent, JobKind, JobState
 from slrig.jobs.store import EVERY_JOB, JobStore
 

@@ -1,4 +1,4 @@
-"""/rig, /device and /preview: the rig as it is held, what else is plugged in, and what a camera sees meanwhile."""
+"""/rig, /device, /preview: devices and live pictures; examinations, health and verification, turntable."""
 
 from __future__ import annotations
 
@@ -9,23 +9,57 @@ from uuid import UUID
 
 import cv2
 import numpy as np
-from fastapi import APIRouter, Path, Query, Response
+from fastapi import APIRouter, Body, Path, Query, Response
 from fastapi.concurrency import run_in_threadpool
 from numpy.typing import NDArray
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 from starlette.responses import StreamingResponse
 
+from slrig.api.calibration import BoardRequest, IfBusy
 from slrig.api.events import StreamPlace
-from slrig.api.openapi import problems
-from slrig.api.schemas import CalibrationInUse, CameraBody, ProjectorBody, RigBody, filled
-from slrig.api.service import Serving
-from slrig.devices import CameraInfo, FoundDevice
+from slrig.api.problems import file_of, problems
+from slrig.api.schemas import (
+    MOST_EXPOSURE_S,
+    AnyFault,
+    CalibrationInUse,
+    CameraBody,
+    JobBody,
+    ProjectorBody,
+    RigBody,
+    ScanRequest,
+    filled,
+    scan_plan,
+)
+from slrig.api.service import IdempotencyKey, Service, Serving, started_once
+from slrig.bundle import (
+    AwareMoment,
+    AxisSource,
+    Strict,
+    TurntableEntry,
+    TurntableRecord,
+    turntable_entry,
+    turntable_record,
+)
+from slrig.calibrate.job import turntable_axis
+from slrig.calibrate.store import session_readings, setting_of
+from slrig.calibrate.verification import VerificationJob, health_svg
+from slrig.calibration import Board
+from slrig.calibration.health import THRESHOLDS, DriftEstimate, HealthState, PairFigures, Thresholds
+from slrig.capture import DEFAULT_SEARCH_S, DEFAULT_TRIALS
+from slrig.conformance import ConformanceJob
+from slrig.devices import CameraInfo, FoundDevice, Trigger
 from slrig.discovery import InstalledDriver, MissingLibrary, OtherSystem, discover_devices, installed_drivers
-from slrig.errors import SlrigError
+from slrig.doctor import EXAMINATIONS, DoctorJob, Examination, LatencyJob, last_examination
+from slrig.errors import CalibrationError, CalibrationStateError, ConfigError, ScanStateError, SlrigError
+from slrig.jobs.job import Job
 from slrig.jobs.manager import RigStatus
-from slrig.jobs.records import utc_now
+from slrig.jobs.records import JobKind, JobRecord, JobState, utc_now
+from slrig.jobs.worker import Task
+from slrig.model_jobs.job import turntable_planes
+from slrig.model_jobs.turntable import TurntableState, state_of, turntable_svg
 from slrig.rig.preview import Light, Watch
-from slrig.rig.settings import SettingsInUse
+from slrig.rig.watchdog import SettingsInUse
+from slrig.scan.artefacts import MESH
 
 _BOUNDARY = "picture"
 _WIDEST_PX = 1280
@@ -182,3 +216,416 @@ def encoded(image: NDArray[np.uint8]) -> bytes:
         message = f"a picture of {width} x {height} could not be encoded as JPEG"
         raise ValueError(message)
     return jpeg.tobytes()
+
+
+examination_router = APIRouter(prefix="/rig", tags=["rig"])
+
+SearchSeconds = Annotated[float, Field(ge=0.01, le=10, description="longest latency to search for, seconds")]
+
+
+class ExaminationBody(JobBody):
+    """An examination on record."""
+
+    summary: dict[str, Any] | None = Field(description="what it found, as the command prints it with --json")
+    links: dict[str, str]
+
+
+class ExaminationRequest(Strict):
+    """An examination of the rig as it stands, before a still object."""
+
+    if_busy: IfBusy = Field(default="reject", description="while the rig is held: answer 409, or wait in line")
+
+
+class DoctorRequest(ExaminationRequest):
+    """An examination of light, timing, picture, response and flicker."""
+
+    search_s: SearchSeconds = DEFAULT_SEARCH_S
+
+
+class LatencyRequest(ExaminationRequest):
+    """A measurement of how late the light is."""
+
+    flashes: int = Field(default=DEFAULT_TRIALS, ge=8, le=1000, description="that each camera must see happen")
+    search_s: SearchSeconds = DEFAULT_SEARCH_S
+    exposure_s: Annotated[float, Field(gt=0, le=MOST_EXPOSURE_S)] | None = None
+    trigger: Annotated[Trigger, Field(strict=False)] | None = Field(
+        default=None, description="how exposures are started. Default: free where a camera can"
+    )
+
+
+class Examinations(BaseModel):
+    """The last examination of each kind; null where there was none."""
+
+    doctor: Examination | None
+    latency: Examination | None
+    conformance: Examination | None
+
+
+@examination_router.get("/examinations")
+def list_examinations(service: Serving) -> Examinations:
+    """Return what each examination found last on this rig. Touches no device."""
+    root, rig = service.folder.root, service.manager.rig.name
+    return Examinations(**{name: last_examination(root, name, rig) for name in Examinations.model_fields})
+
+
+@examination_router.post("/doctor", status_code=202, responses=problems(409, 429, 502, 503, 507))
+def examine_rig(
+    service: Serving,
+    response: Response,
+    request: Annotated[DoctorRequest, Body(default_factory=DoctorRequest)],
+    idempotency_key: IdempotencyKey = None,
+) -> ExaminationBody:
+    """Examine the rig for faults of light, timing, focus and flicker. The answer comes at once; look again later."""
+    plan = scan_plan(ScanRequest(), service.scan_defaults)
+    job = DoctorJob(plan.patterns, service.scan_defaults.exposure_s, request.search_s)
+    return _started(service, response, job, request, idempotency_key)
+
+
+@examination_router.post("/latency", status_code=202, responses=problems(409, 429, 502, 503, 507))
+def measure_rig_latency(
+    service: Serving,
+    response: Response,
+    request: Annotated[LatencyRequest, Body(default_factory=LatencyRequest)],
+    idempotency_key: IdempotencyKey = None,
+) -> ExaminationBody:
+    """Flash the projector, and measure how late its light is and how each camera's shutter rolls."""
+    job = LatencyJob(request.flashes, request.search_s, request.exposure_s, request.trigger)
+    return _started(service, response, job, request, idempotency_key)
+
+
+@examination_router.post("/conformance", status_code=202, responses=problems(409, 429, 502, 503, 507))
+def check_conformance(
+    service: Serving,
+    response: Response,
+    request: Annotated[ExaminationRequest, Body(default_factory=ExaminationRequest)],
+    idempotency_key: IdempotencyKey = None,
+) -> ExaminationBody:
+    """Check that the rig's drivers keep their contract. The rig is closed and opened many times."""
+    job = ConformanceJob(scan_plan(ScanRequest(), service.scan_defaults).patterns)
+    return _started(service, response, job, request, idempotency_key)
+
+
+@examination_router.get("/job/{job_id}")
+def look_at_rig_job(service: Serving, job_id: UUID) -> ExaminationBody:
+    """Return an examination: its state, and what was found, or why nothing was."""
+    return _examination(service.store.get(job_id, *EXAMINATIONS))
+
+
+@examination_router.post("/job/{job_id}/cancel", status_code=202)
+def cancel_rig_job(service: Serving, job_id: UUID) -> ExaminationBody:
+    """Ask an examination to end early. May be repeated."""
+    return _examination(service.manager.cancel(service.store.get(job_id, *EXAMINATIONS).id))
+
+
+def _started(
+    service: Service, response: Response, job: Job, request: ExaminationRequest, key: str | None
+) -> ExaminationBody:
+    def start(key: str | None) -> UUID:
+        return service.manager.submit(job, wait=request.if_busy == "queue", key=key)[0].id
+
+    body = _examination(started_once(service.keys, service.store, key, f"/rig/{job.kind}", request, start))
+    response.headers["Location"] = body.links["self"]
+    return body
+
+
+def _examination(record: JobRecord) -> ExaminationBody:
+    here = f"{record.kind.path}/{record.id}"
+    links = {"self": here, "events": f"{here}/events", "cancel": f"{here}/cancel", "last": "/rig/examinations"}
+    return filled(ExaminationBody, record, error=record.fault, links=links)
+
+
+health_router = APIRouter(prefix="/rig", tags=["health"])
+
+
+class VerificationFigures(BaseModel):
+    """What one verification found."""
+
+    id: UUID
+    at: datetime
+    calibration: str
+    kind: str = Field(description="board or scan")
+    state: HealthState
+    reasons: list[str]
+    remedy: str | None
+    pairs: list[PairFigures]
+    scale_percent: float | None
+    scale_sigma_percent: float | None
+    scale_mm: float | None
+    expected_mm: float | None
+    stated_mm: float | None
+    drift_mm: float | None
+    drifts: list[DriftEstimate]
+    open: str | None = Field(description="what the geometry leaves open")
+    unseen: list[str] = Field(description="devices that took no part, of which nothing was learned")
+
+
+class HealthBody(BaseModel):
+    """The health of the calibration in use."""
+
+    state: HealthState
+    reasons: list[str]
+    remedy: str | None
+    calibration: str | None
+    calibration_age_s: float | None
+    refuses_scans_when_stale: bool
+    thresholds: Thresholds
+    latest: VerificationFigures | None
+    links: dict[str, str]
+
+
+class HealthPage(BaseModel):
+    """Verifications, newest first."""
+
+    verifications: list[VerificationFigures]
+
+
+class VerificationRequest(Strict):
+    """A verification. An empty request shoots the board of the calibration in use, where it is."""
+
+    board: BoardRequest | None = Field(default=None, description="Default: that of the active calibration")
+    position: Annotated[int, Field(ge=0, le=10_000)] | None = Field(
+        default=None, description="of the positioner, by its number from 0. Default: the board stays where it is"
+    )
+    exposure_s: Annotated[float, Field(gt=0, le=MOST_EXPOSURE_S)] | None = None
+    if_busy: IfBusy = Field(default="reject", description="while the rig is held: answer 409, or wait in line")
+
+
+class VerificationBody(BaseModel):
+    """A verification that was asked for."""
+
+    id: UUID
+    state: JobState
+    created_at: datetime
+    found: VerificationFigures | None
+    error: AnyFault
+    links: dict[str, str]
+
+
+@health_router.get("/health")
+def look_at_health(service: Serving) -> HealthBody:
+    """Return whether the calibration in use still holds, why, and what to do. Touches no device."""
+    health, latest, calibration = service.health.health()
+    solved = None if calibration is None else calibration.solved
+    age_s = None if solved is None else (utc_now() - datetime.fromisoformat(solved.solved_at)).total_seconds()
+    return filled(
+        HealthBody,
+        health,
+        calibration=None if calibration is None else calibration.solve_id,
+        calibration_age_s=age_s,
+        refuses_scans_when_stale=service.refuse_when_stale,
+        thresholds=THRESHOLDS,
+        latest=None if latest is None else VerificationFigures.model_validate(latest.document()),
+        links={"history": "/rig/health/history", "plot": "/rig/health.svg", "verify": "/rig/verification"},
+    )
+
+
+@health_router.get("/health/history")
+def list_health(
+    service: Serving,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    since: Annotated[AwareMoment | None, Query(description="ISO 8601, with its offset from UTC")] = None,
+) -> HealthPage:
+    """List verifications, newest first."""
+    found = service.health.store.history(limit=limit, since=since)
+    return HealthPage(verifications=[VerificationFigures.model_validate(record.document()) for record in found])
+
+
+@health_router.get(
+    "/health.svg",
+    response_class=Response,
+    responses=file_of("image/svg+xml"),
+)
+def plot_health(service: Serving, limit: Annotated[int, Query(ge=1, le=2000)] = 500) -> Response:
+    """Draw the newest verifications over time."""
+    records = service.health.store.history(limit=limit)
+    return Response(health_svg(records[::-1]), media_type="image/svg+xml")
+
+
+@health_router.post("/verification", status_code=202, responses=problems(409, 429, 502, 503, 507))
+def verify_rig(
+    service: Serving,
+    response: Response,
+    request: Annotated[VerificationRequest, Body(default_factory=VerificationRequest)],
+    idempotency_key: IdempotencyKey = None,
+) -> VerificationBody:
+    """Shoot the board and judge the calibration in use by it. The answer comes at once; look again later."""
+    board = _board_in_use(service) if request.board is None else request.board.board()
+
+    def start(key: str | None) -> UUID:
+        job = VerificationJob(board, request.position, request.exposure_s)
+        return service.manager.submit(job, wait=request.if_busy == "queue", key=key)[0].id
+
+    body = _verification(
+        started_once(service.keys, service.store, idempotency_key, "/rig/verification", request, start)
+    )
+    response.headers["Location"] = body.links["self"]
+    return body
+
+
+@health_router.get("/verification/{verification_id}")
+def look_at_verification(service: Serving, verification_id: UUID) -> VerificationBody:
+    """Return a verification: its state, and what was found, or why nothing was."""
+    return _verification(service.store.get(verification_id, JobKind.VERIFICATION))
+
+
+@health_router.post("/verification/{verification_id}/cancel", status_code=202)
+def cancel_verification(service: Serving, verification_id: UUID) -> VerificationBody:
+    """Ask a verification to end early. May be repeated."""
+    return _verification(service.manager.cancel(service.store.get(verification_id, JobKind.VERIFICATION).id))
+
+
+def _board_in_use(service: Service) -> Board:
+    """The board of the active calibration. Raises CalibrationError where there is none."""
+    active = service.calibrations.active
+    board = None if active is None else service.calibrations.register.get(active).board
+    if board is None:
+        message = (
+            "board: the calibration in use was imported or is the rig's own, and its board is not known here; send "
+            '"board" with the kind, corners and square_mm of the one that is in view'
+        )
+        raise CalibrationError(message)
+    return board
+
+
+def _verification(job: JobRecord) -> VerificationBody:
+    here = f"/rig/verification/{job.id}"
+    links = {"self": here, "events": f"{here}/events", "cancel": f"{here}/cancel", "health": "/rig/health"}
+    return filled(VerificationBody, job, found=job.summary, error=job.fault, links=links)
+
+
+turntable_router = APIRouter(prefix="/rig", tags=["turntable"])
+
+_MOST_POSES = 100
+
+
+class TurntableBody(BaseModel):
+    """What is known of the turntable. `document` can be kept, and put back with PUT."""
+
+    state: TurntableState
+    remedy: str = Field(description="what to do; empty where nothing is to be done")
+    point_sigma_mm: float | None = Field(description="standard deviation of the axis' point across it")
+    direction_sigma_deg: float | None = Field(description="the same of its direction")
+    document: TurntableEntry
+    links: dict[str, str]
+
+
+class AxisRequest(Strict):
+    """The axis from a session in which a board stood on the turntable, turned from pose to pose."""
+
+    calibration: Annotated[UUID, Field(strict=False)] = Field(
+        description="the session; it need not be solved, and need not be the calibration in use"
+    )
+    poses: Annotated[list[int], Field(max_length=_MOST_POSES)] | None = Field(
+        default=None, description="their numbers. Default: all that were accepted"
+    )
+    angles_deg: Annotated[list[float], Field(max_length=_MOST_POSES)] | None = Field(
+        default=None, description="where the turntable says that it stood, pose by pose. Default: not known"
+    )
+
+
+class PlanesRequest(Strict):
+    """The planes from a scan of the turntable with nothing on it."""
+
+    scan: Annotated[UUID, Field(strict=False)]
+
+
+class TurntablePose(BaseModel):
+    """A pose of the board. error_deg : of the turntable's angle, null where it was not told."""
+
+    name: str
+    residual_mm: float = Field(description="rms distance of the board's corners from where a pure turn puts them")
+    angle_deg: float
+    error_deg: float | None
+
+
+class AxisBody(TurntableBody):
+    """The axis that was calibrated, and the poses that tell it."""
+
+    poses: list[TurntablePose]
+
+
+@turntable_router.get("/turntable")
+def get_turntable(service: Serving) -> TurntableBody:
+    """Return the axis of the turntable, its planes, how the axis came to be, and whether it still holds."""
+    return _turntable(service.turntable.record())
+
+
+@turntable_router.get("/turntable.svg", response_class=Response, responses=file_of("image/svg+xml"))
+def plot_turntable(service: Serving) -> Response:
+    """Draw how the axis has moved."""
+    return Response(turntable_svg(service.turntable.record().history), media_type="image/svg+xml")
+
+
+@turntable_router.post("/turntable/axis", responses=problems(404, 409, 503, 507))
+def calibrate_turntable(service: Serving, request: Annotated[AxisRequest, Body()]) -> AxisBody:
+    """Calibrate the axis from poses of a board that stood on the turntable, by the calibration in use."""
+    record = service.calibrations.register.get(request.calibration)
+    board, (_, _, calibration) = setting_of(record).board, service.health.health()
+    if calibration is None:
+        message = "The rig has no calibration in use, by which poses of a board tell an axis. Activate one first."
+        raise CalibrationStateError(message)
+    numbers_of = [pose.number for pose in record.accepted]
+    readings = session_readings(service.calibrations.store.folder(record.id))
+    accepted = dict(zip(numbers_of, readings, strict=True))
+    numbers = numbers_of if request.poses is None else request.poses
+    missing = [str(number) for number in numbers if number not in accepted]
+    if missing or len(set(numbers)) < len(numbers):
+        message = f"poses: expected accepted poses of calibration {record.id}, each once, found {numbers}; there are "
+        raise ConfigError(message + (", ".join(map(str, accepted)) or "none"))
+    if request.angles_deg is not None and len(request.angles_deg) != len(numbers):
+        message = f"angles_deg: expected one for each of {len(numbers)} poses, found {len(request.angles_deg)}"
+        raise ConfigError(message)
+    observed = [accepted[number].observation for number in numbers]
+    given = (observed, board, calibration, request.angles_deg)
+    found = service.worker.run(Task(turntable_axis, given, what="axis of the turntable"))
+    turntable = service.turntable.put_axis(found.axis.measured_axis, source=AxisSource.BOARD, of=str(record.id))
+    poses = [
+        TurntablePose(
+            name=name, residual_mm=left, angle_deg=found.angles_deg[name], error_deg=found.errors_deg.get(name)
+        )
+        for name, left in found.residual_mm.items()
+    ]
+    return AxisBody(**dict(_turntable(turntable)), poses=poses)
+
+
+@turntable_router.post("/turntable/planes", responses=problems(404, 409, 503, 507))
+def find_planes(service: Serving, request: Annotated[PlanesRequest, Body()]) -> TurntableBody:
+    """Find plate and backdrops in a scan of the empty turntable. Views of models are cut by them from then on."""
+    scan, mesh = service.store.get(request.scan, JobKind.SCAN), service.folder.scan(request.scan) / MESH
+    if scan.state is not JobState.SUCCEEDED or not service.folder.owns(mesh):
+        message = (
+            f"Scan {request.scan} is {scan.state} and has no {MESH} here. Scan the empty turntable, and wait for it."
+        )
+        raise ScanStateError(message)
+    found = service.worker.run(Task(turntable_planes, (mesh, service.turntable.axis()), what="planes of the turntable"))
+    return _turntable(service.turntable.put_planes(found))
+
+
+@turntable_router.put("/turntable", responses=problems(507))
+def replace_turntable(service: Serving, request: Annotated[TurntableEntry, Body()]) -> TurntableBody:
+    """Put back a document that was kept, in place of all that is known."""
+    return _turntable(service.turntable.replace(turntable_record(request)))
+
+
+@turntable_router.delete("/turntable", status_code=204, responses=problems(507))
+def delete_turntable(service: Serving) -> None:
+    """Forget axis, planes and history, a damaged record too."""
+    service.turntable.delete()
+
+
+def _turntable(record: TurntableRecord) -> TurntableBody:
+    state, remedy = state_of(record)
+    axis = record.axis
+    return TurntableBody(
+        state=state,
+        remedy=remedy,
+        point_sigma_mm=None if axis is None else axis.point_sigma_mm,
+        direction_sigma_deg=None if axis is None else float(np.rad2deg(axis.direction_sigma_rad)),
+        document=turntable_entry(record),
+        links={
+            "self": "/rig/turntable",
+            "plot": "/rig/turntable.svg",
+            "axis": "/rig/turntable/axis",
+            "planes": "/rig/turntable/planes",
+        },
+    )

@@ -1,24 +1,27 @@
-"""/scan: start, list, look at, cancel, delete."""
+"""/scan: start, list, get, cancel, pin, delete; /exposure and /preset."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Any
 from uuid import UUID
 
-from fastapi import APIRouter, Body, Response
+from fastapi import APIRouter, Body, Path, Response
+from pydantic import BaseModel, Field
 
-from slrig.api.artefacts import ready_files
-from slrig.api.idempotency import IdempotencyKey, started_once
-from slrig.api.openapi import problems
-from slrig.api.schemas import ScanBody, ScanPage, ScanRequest, ScanSeries, scan_body, scan_plan
-from slrig.api.service import Cursor, PageLength, Service, Serving, paged
+from slrig.api.files import ready_files
+from slrig.api.problems import problems
+from slrig.api.schemas import PatternRequest, ScanBody, ScanPage, ScanRequest, ScanSeries, filled, scan_body, scan_plan
+from slrig.api.service import Cursor, IdempotencyKey, PageLength, Service, Serving, paged, started_once
+from slrig.bundle import PresetDocument, PresetName, Strict
 from slrig.calibrate.verification import require_healthy
 from slrig.jobs.records import JobKind, JobRecord
 from slrig.model import MAX_MASK_CHARACTERS
+from slrig.scan.exposure import proposed_exposures
 from slrig.scan.job import cancel_series as _cancel_series
 from slrig.scan.job import scans_of, series
+from slrig.scan.plan import PresetSource
 
 MOST_SCAN_BYTES = 4 * MAX_MASK_CHARACTERS
 """Of a request: masks of four cameras as long as any may be, or of more as they are."""
@@ -110,3 +113,105 @@ def delete_scan(service: Serving, scan_id: UUID) -> None:
 
 def _body(service: Service, record: JobRecord) -> ScanBody:
     return scan_body(record, ready_files(service.folder, record))
+
+
+exposure_router = APIRouter(prefix="/exposure", tags=["scan"])
+
+_SAME = ("preset", "patterns", "coloured_light")  # as in the scan that is going to be asked for
+
+
+class ExposureRequest(Strict):
+    """What the scan is going to be like, as far as it is known."""
+
+    budget_s: Annotated[float, Field(gt=0, le=3600)] | None = Field(
+        default=None, description="the most that capture may take, seconds. Default: as long as the object needs"
+    )
+    preset: PresetName | None = Field(default=None, description="as in POST /scan; its exposures do not count")
+    patterns: PatternRequest = Field(default_factory=PatternRequest)
+    coloured_light: bool | None = Field(default=None, description="as in POST /scan: it takes more frames")
+
+
+class CoverBody(BaseModel):
+    """One exposure, and shares of the lit pixels."""
+
+    exposure_s: float
+    well: float = Field(description="white stands well out of black")
+    decoded: float = Field(description="clear enough to be decoded, those among them")
+    too_dark: float
+    saturated: float
+
+
+class ExposureBody(BaseModel):
+    """A proposal."""
+
+    scan: dict[str, Any] = Field(description="the body of POST /scan that asks for it; keys may be added")
+    exposures: list[CoverBody] = Field(description="those proposed")
+    others: list[CoverBody] = Field(description="the others that were considered")
+    completeness: float = Field(description="share of the lit pixels that they decode together")
+    well: float = Field(description="share that stands well out of black in one of them at least")
+    too_dark: float = Field(description="share that remains too dark")
+    saturated: float = Field(description="share that remains saturated")
+    lit: float = Field(description="share of the cameras' pixels that the projector lights")
+    seconds: float = Field(description="that capture would take")
+    notes: list[str] = Field(description="what remains uncovered, and what to do about it")
+
+
+@exposure_router.post("", responses=problems(404, 409, 502, 503, 504))
+def propose_exposures(
+    service: Serving, request: Annotated[ExposureRequest, Body(default_factory=ExposureRequest)]
+) -> ExposureBody:
+    """Look at the object under white and black light for some seconds, and propose exposures for a scan of it."""
+    preset = None if request.preset is None else service.presets.get(request.preset)
+    asked = ScanRequest(**{key: getattr(request, key) for key in _SAME})
+    plan = scan_plan(asked, service.scan_defaults, preset)
+    found = proposed_exposures(service.manager, plan, budget_s=request.budget_s)
+    times_s = [each.exposure_s for each in found.exposures]
+    exposing: dict[str, Any] = {"exposure_s": times_s[0]} if len(times_s) == 1 else {"exposures_s": times_s}
+    same = request.model_dump(exclude_unset=True, include=set(_SAME))
+    return filled(ExposureBody, found, scan={**same, **exposing})
+
+
+preset_router = APIRouter(prefix="/preset", tags=["scan"])
+
+Name = Annotated[PresetName, Path(description="what a request of a scan calls it")]
+
+
+class PresetLine(BaseModel):
+    """A preset by its name."""
+
+    name: str
+    source: PresetSource
+    description: str | None
+    digest: str | None
+    fault: str | None = Field(description="what is wrong with its file; it cannot be used then")
+
+
+class PresetList(BaseModel):
+    """All presets, by name."""
+
+    presets: list[PresetLine]
+
+
+@preset_router.get("", responses=problems())
+def list_presets(service: Serving) -> PresetList:
+    """List the presets: shipped ones, those of the rig file, and those kept here."""
+    return PresetList(presets=[filled(PresetLine, each) for each in service.presets.listed()])
+
+
+@preset_router.get("/{name}", response_model_exclude_none=True, responses=problems(404))
+def look_at_preset(service: Serving, name: Name) -> PresetDocument:
+    """Return a preset as a document that another rig's service takes as it is."""
+    return service.presets.get(name)
+
+
+@preset_router.put("/{name}", response_model_exclude_none=True, responses=problems(507))
+def put_preset(service: Serving, name: Name, document: PresetDocument) -> PresetDocument:
+    """Keep a preset by this name, in place of what had it."""
+    service.presets.put(name, document)
+    return document
+
+
+@preset_router.delete("/{name}", status_code=204, responses=problems(404))
+def delete_preset(service: Serving, name: Name) -> None:
+    """Delete a preset that was put. A shipped one, or the rig file's, of its name is seen again."""
+    service.presets.delete(name)

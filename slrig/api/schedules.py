@@ -10,12 +10,12 @@ from uuid import UUID
 from fastapi import APIRouter, Body, Response
 from pydantic import BaseModel, Field
 
-from slrig.api.openapi import problems
+from slrig.api.problems import problems
 from slrig.api.schemas import filled
 from slrig.api.service import Cursor, PageLength, Serving, paged
 from slrig.bundle import FreeText, Strict
 from slrig.jobs.records import utc_now
-from slrig.schedule.records import LEAST_RETRY_S, MOST_GRACE_S, Cron, Schedule, ScheduledRun, ScheduleSpec, TaskKind
+from slrig.schedule.store import LEAST_RETRY_S, MOST_GRACE_S, Cron, Schedule, ScheduledRun, ScheduleSpec, TaskKind
 
 router = APIRouter(prefix="/schedule", tags=["schedule"])
 

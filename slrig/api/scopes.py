@@ -1,11 +1,11 @@
-"""What a key is for, and what for a request needs one."""
+"""Scopes of keys, and the scope that a request needs. Loads nothing heavy: commands read it."""
 
 from __future__ import annotations
 
 from enum import StrEnum
 
 
-class Scope(StrEnum):
+class KeyScope(StrEnum):
     """What a key is for. Every key may look."""
 
     LOOK = "look"
@@ -15,18 +15,20 @@ class Scope(StrEnum):
 
 
 READING = frozenset({"GET", "HEAD", "OPTIONS"})
+
+
 _SCOPES = {
-    "session": Scope.LOOK,
-    "scan": Scope.SCAN,
-    "model": Scope.SCAN,
-    "exposure": Scope.SCAN,
-    "calibration": Scope.CALIBRATE,
-    "acceptance": Scope.CALIBRATE,
-    "rig": Scope.CALIBRATE,
+    "session": KeyScope.LOOK,
+    "scan": KeyScope.SCAN,
+    "model": KeyScope.SCAN,
+    "exposure": KeyScope.SCAN,
+    "calibration": KeyScope.CALIBRATE,
+    "acceptance": KeyScope.CALIBRATE,
+    "rig": KeyScope.CALIBRATE,
 }
 
 
-def needed_scope(method: str, path: str) -> Scope:
+def needed_scope(method: str, path: str) -> KeyScope:
     """What a key must be for to send this request: reading is looking, but for a preview, which takes the rig.
 
     >>> [str(needed_scope("GET", path)) for path in ("/scan", "/preview/left", "/audit")]
@@ -36,8 +38,8 @@ def needed_scope(method: str, path: str) -> Scope:
     """
     room = path.split("/")[1] if "/" in path else ""
     if moves(method, path):
-        return Scope.SCAN if room == "preview" else _SCOPES.get(room, Scope.ADMINISTER)
-    return Scope.ADMINISTER if room == "audit" else Scope.LOOK
+        return KeyScope.SCAN if room == "preview" else _SCOPES.get(room, KeyScope.ADMINISTER)
+    return KeyScope.ADMINISTER if room == "audit" else KeyScope.LOOK
 
 
 def moves(method: str, path: str) -> bool:

@@ -1,44 +1,126 @@
-"""What the routers work with: the parts of one running service."""
+"""The parts of one running service, which routers use; idempotent requests; and how long requests take."""
 
 from __future__ import annotations
 
+import hashlib
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Annotated, TypeVar
 from uuid import UUID
 
 import structlog
-from fastapi import Depends, Query, Request, Response
+from fastapi import Depends, Header, Query, Request, Response
+from prometheus_client import CollectorRegistry, Histogram
+from pydantic import BaseModel
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from slrig.accept.job import AcceptanceTests
-from slrig.api.latency import Durations
 from slrig.bundle import Preset, ScanDefaults
-from slrig.calibrate.calibrating import Calibrations
-from slrig.calibrate.retention import Retention
+from slrig.calibrate.job import Calibrations, Retention
 from slrig.calibrate.verification import RigHealth
-from slrig.catalogue.copying import Copier
-from slrig.catalogue.standing import standing
-from slrig.catalogue.store import catalogue_of
-from slrig.combine.job import TURNTABLE, Models
-from slrig.combine.shooting import ViewShooting
-from slrig.combine.turntable import TurntableStore
+from slrig.catalogue.store import Copier, catalogue_of, standing
 from slrig.config import ServiceSettings
-from slrig.jobs.audit import Audit, AuditEntry
-from slrig.jobs.examinations import EXAMINATIONS, Examinations
-from slrig.jobs.keys import RequestKeys
+from slrig.doctor import EXAMINATIONS, Examinations
 from slrig.jobs.manager import JobManager
-from slrig.jobs.records import JobKind, JobRecord, utc_now
+from slrig.jobs.records import JobEvent, JobKind, JobProgress, JobRecord, JobState, stages_of, utc_now
 from slrig.jobs.resume import resume
+from slrig.jobs.store import Audit, AuditEntry, JobStore, RequestKeys
+from slrig.model_jobs.job import TURNTABLE, Models, ViewShooting
+from slrig.model_jobs.turntable import TurntableStore
 from slrig.plugins import OBSERVERS, load
-from slrig.scan.presets import Presets
-from slrig.scan.retention import ScanLimits, ScanRetention
-from slrig.schedule.notices import NoticedHealth, tell_run
-from slrig.schedule.receivers import senders_of
-from slrig.schedule.records import ScheduledRun
-from slrig.schedule.scheduler import Scheduler
-from slrig.schedule.store import ScheduleStore
-from slrig.schedule.tasks import Tasks
+from slrig.scan.job import ScanLimits, ScanRetention
+from slrig.scan.plan import Presets
+from slrig.schedule.notices import NoticedHealth, senders_of, tell_run
+from slrig.schedule.scheduler import Scheduler, Tasks
+from slrig.schedule.store import ScheduledRun, ScheduleStore
+
+_ANSWER_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
+"""From what a kept-alive request takes on loopback, a millisecond, to where the records give up on a locked file."""
+
+_JOB_S = (1.0, 2.5, 5.0, 10.0, 20.0, 40.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0)
+"""From a verification of a few frames to a bracketed scan of large cameras that waits in line behind others."""
+
+_STAGE_S = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
+"""From writing a small picture to the optimisation of a large mesh, or a wait in line."""
+
+_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "DELETE"})
+_OTHER = "other"
+
+
+class Durations:
+    """What this process measured since its start. Any thread may call."""
+
+    def __init__(self) -> None:
+        # Of its own: several services in one process, as in tests, do not meet in it.
+        self.registry = CollectorRegistry()
+        self._answers = Histogram(
+            "slrig_http_response_start_seconds",
+            "From a request to the head of its answer, by method, path as documented, and class of status. `other`: no "
+            "documented method or path, or refused before the path was looked at.",
+            ("method", "path", "status"), buckets=_ANSWER_S, registry=self.registry,
+        )  # fmt: skip
+        self._jobs = Histogram(
+            "slrig_job_duration_seconds",
+            "From the request of a job to its end, by kind and final state.",
+            ("kind", "state"), buckets=_JOB_S, registry=self.registry,
+        )  # fmt: skip
+        self._stages = Histogram(
+            "slrig_job_stage_duration_seconds",
+            "What each stage of a job took: its states, and the stages of its computation.",
+            ("kind", "stage"), buckets=_STAGE_S, registry=self.registry,
+        )  # fmt: skip
+
+    def answered(self, method: str, path: str | None, status: int, seconds: float) -> None:
+        """Take note of an answer. path : of the route, None where there is none."""
+        labels = (method if method in _METHODS else _OTHER, path or _OTHER, f"{status // 100}xx")
+        self._answers.labels(*labels).observe(seconds)
+
+    def ended(self, record: JobRecord, events: Sequence[JobEvent]) -> None:
+        """Take note of a job's end."""
+        if record.finished_at is not None:
+            seconds = (record.finished_at - record.created_at).total_seconds()
+            self._jobs.labels(record.kind, record.state).observe(seconds)
+        for stage in stages_of(record, events):
+            self._stages.labels(record.kind, stage.name).observe(stage.seconds)
+
+
+class Latency:
+    """Middleware that measures until the answer begins: a stream is no hour of waiting."""
+
+    def __init__(self, app: ASGIApp, *, durations: Durations) -> None:
+        self._app = app
+        self._durations = durations
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        begun_s = time.perf_counter()
+        started = False
+
+        def note(status: int) -> None:
+            path = getattr(scope.get("route"), "path_format", None)
+            self._durations.answered(scope["method"], path, status, time.perf_counter() - begun_s)
+
+        async def measured(message: Message) -> None:
+            nonlocal started
+            if message["type"] == "http.response.start":
+                started = True
+                note(message["status"])
+            await send(message)
+
+        try:
+            await self._app(scope, receive, measured)
+        except Exception:
+            # Whatever is outside of this makes a 500 of it.
+            if not started:
+                note(500)
+            raise
+
 
 _log = structlog.get_logger(__name__)
 
@@ -223,3 +305,74 @@ def paged(
     following = f"{path}?cursor={records[limit - 1].number}&limit={limit}"
     response.headers["Link"] = f'<{following}>; rel="next"'
     return records[:limit], following
+
+
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        min_length=1,
+        max_length=255,
+        description="makes a repeat of this request return what the first one made instead of making another; kept "
+        "for a day, or as long as the service's settings say",
+    ),
+]
+
+
+def once(
+    keys: RequestKeys,
+    key: str | None,
+    path: str,
+    request: BaseModel,
+    start: Callable[[str | None], UUID],
+) -> UUID:
+    """The id of what a request makes, or made before with this key.
+
+    path : where the request was sent; the same key may be sent elsewhere. start : makes it, and ties it to the key that
+    it is given; what it raises leaves the key free.
+
+    Raises
+    ------
+    IdempotencyError
+        The key was sent with another request, or its first request is still being answered.
+    """
+    if key is None:
+        return start(None)
+    mine = own_key(key, path)
+    earlier = keys.reserve(mine, fingerprint(request))
+    if earlier is not None:
+        return earlier
+    try:
+        return start(mine)
+    finally:
+        # Does nothing when the key has what it made; a refused request may be tried again with the same key.
+        keys.release(mine)
+
+
+def started_once(
+    keys: RequestKeys,
+    store: JobStore,
+    key: str | None,
+    path: str,
+    request: BaseModel,
+    start: Callable[[str | None], UUID],
+) -> JobRecord:
+    """The job that a request makes, or made before with this key, as it was when it was made. See `once`."""
+    return replace(
+        store.get(once(keys, key, path, request, start)),
+        state=JobState.QUEUED,
+        started_at=None,
+        finished_at=None,
+        progress=JobProgress("waiting", 0.0, ""),
+        fault=None,
+        summary=None,
+    )
+
+
+def own_key(key: str, path: str) -> str:
+    """A key as it is on record: that of the requests to one path."""
+    return f"{path} {key}"
+
+
+def fingerprint(request: BaseModel) -> str:
+    """What tells two requests with one idempotency key apart: equal for equal requests, however they were written."""
+    return hashlib.sha256(request.model_dump_json().encode()).hexdigest()

@@ -1,28 +1,38 @@
-"""/metrics for Prometheus, probes, and what each kind of problem means. None of it touches a device."""
+"""/metrics, probes, kinds of problems, /audit, /fleet and the page's files. None of it touches a device."""
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator
 from datetime import datetime
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Response
+from fastapi import APIRouter, Response
+from fastapi import Path as PathParameter
 from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 from prometheus_client.registry import Collector
+from pydantic import BaseModel
 from starlette.exceptions import HTTPException
+from starlette.middleware.gzip import GZipMiddleware
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp
 
-from slrig.api.openapi import problems
-from slrig.api.problems import answer, explanations, problem
+from slrig.api.problems import answer, explanations, problem, problems
 from slrig.api.schemas import Explanation, Probe
-from slrig.api.service import Probed, Service, Serving
+from slrig.api.service import Cursor, PageLength, Probed, Service, Serving, paged
 from slrig.calibration.health import HealthState
+from slrig.catalogue.store import Fleet
 from slrig.errors import StorageError
 from slrig.jobs.manager import RigStatus
 from slrig.jobs.records import JobKind, JobState, utc_now
-from slrig.schedule.records import RunState, TaskKind
+from slrig.jobs.store import AuditEntry
+from slrig.schedule.store import RunState, TaskKind
 
 router = APIRouter(tags=["system"])
 
@@ -160,7 +170,7 @@ def readyz(service: Probed) -> Response | Probe:
 
 
 @router.get("/problems/{name}")
-def explain_problem(name: Annotated[str, Path(max_length=64)]) -> Explanation:
+def explain_problem(name: Annotated[str, PathParameter(max_length=64)]) -> Explanation:
     """Explain a kind of problem: what `type` in an error leads to."""
     text = explanations().get(name)
     if text is None:
@@ -185,3 +195,80 @@ def _rig(status: RigStatus) -> str:
     if status.facts is not None:
         return "ok"
     return f"the rig is being opened: {status.opening}" if status.opening else "the rig is being opened"
+
+
+class AuditPage(BaseModel):
+    """Entries from new to old. `next` asks for the page after this one, null on the last."""
+
+    entries: list[AuditEntry]
+    next: str | None
+
+
+@router.get("/audit")
+def list_audit(service: Serving, response: Response, cursor: Cursor = None, limit: PageLength = 50) -> AuditPage:
+    """List who did what, from new to old: every request that writes, and every one that was refused for its key's scope
+    or number. Names are those of keys.
+    """
+    shown, following = paged(
+        lambda most: service.audit.page(before=cursor, limit=most), limit, "/audit", service, response
+    )
+    return AuditPage(entries=list(shown), next=following)
+
+
+@router.get("/fleet", responses=problems(404, 503, 507))
+def look_at_fleet(service: Serving) -> Fleet:
+    """List the rigs that share a catalogue with this one: how each is, its health, its last scan and its backlog.
+
+    A catalogue that is away is not waited for: 503 says since when it was tried, and the rig scans on.
+    """
+    if service.copier is None:
+        detail = (
+            "This service shares no catalogue with others. Name one in its settings: catalogue = "
+            '"postgresql://HOST:PORT/DATABASE" and catalogue_login_file, a file with USER:PASSWORD and mode 0600.'
+        )
+        raise HTTPException(404, detail)
+    return service.copier.fleet()
+
+
+FOLDER = Path(__file__).resolve().parents[1] / "page"
+FILES_PATH = "/page"
+
+_INDEX = (FOLDER / "index.html").read_text(encoding="utf-8")
+_INLINE = re.compile(r"<script[^>]*>(.+?)</script>", re.DOTALL)
+
+page_router = APIRouter(include_in_schema=False)
+
+
+def policy(html: str) -> str:
+    """What a page of ours may load: what comes from here, and those scripts within it that are there now.
+
+    An import map has to stand within a page: browsers take none from a file.
+    """
+    digests = (hashlib.sha256(script.encode()).digest() for script in _INLINE.findall(html))
+    scripts = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
+    return (
+        f"default-src 'none'; script-src 'self' {scripts}; style-src 'self'; img-src 'self' blob: data:; "
+        "connect-src 'self'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
+    )
+
+
+@page_router.get("/")
+def show_page() -> Response:
+    """Show the page of the service."""
+    return Response(_INDEX, media_type="text/html", headers={"Content-Security-Policy": policy(_INDEX)})
+
+
+class _Checked(StaticFiles):
+    """Files that a browser keeps, and asks after at each visit: with a new service the page is a new one, too."""
+
+    def file_response(self, *args: Any, **options: Any) -> Response:
+        """See `StaticFiles.file_response`."""
+        response = super().file_response(*args, **options)
+        response.headers["Cache-Control"] = "no-cache"
+        return response
+
+
+def page_files() -> ASGIApp:
+    """What the page loads, packed for the way."""
+    # Smaller ones fit one packet as they are.
+    return GZipMiddleware(_Checked(directory=FOLDER), minimum_size=1400)

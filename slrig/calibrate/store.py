@@ -1,4 +1,4 @@
-"""Calibrations on disk, each a folder that is whole at every instant.
+"""Sessions and poses as values, and calibrations on disk, each a folder that is whole at every instant.
 
 DATA/calibrations/ID/session.json      the session: board, devices, figures; its poses and solves are jobs on record
 DATA/calibrations/ID/poses/NN/         a pose: bundle/, answer.json, picture-CAMERA.png, and reading.npz if accepted
@@ -13,26 +13,316 @@ from __future__ import annotations
 import io
 import json
 import shutil
+import threading
 import uuid
 import zipfile
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, cast
-from uuid import UUID
+from uuid import UUID, uuid4
 
 import numpy as np
+import structlog
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import to_jsonable_python
 
 from slrig.bundle import read_calibration, sync_folder, sync_tree, write_durably, write_file
-from slrig.calibrate.records import SessionRecord, pose_of, session_from_json, session_json
-from slrig.calibrate.solving import ReadPose
-from slrig.calibration import BoardView, Correspondences, PoseObservation, ViewQuality
-from slrig.errors import CalibrationError, StorageError
-from slrig.failure import disk_errors
+from slrig.calibration import (
+    PROJECTOR,
+    Board,
+    BoardShape,
+    BoardView,
+    Correspondences,
+    ExpectedError,
+    Observations,
+    PoseObservation,
+    Solution,
+    ViewQuality,
+)
+from slrig.calibration.accuracy import OddEven, compare_halves
+from slrig.calibration.judgement import Verdict, check_scale, judge_calibration
+from slrig.calibration.poses import Coverage, coverage
+from slrig.errors import (
+    CalibrationError,
+    CalibrationNotFoundError,
+    CalibrationStateError,
+    InvalidInputError,
+    PoseRefusedError,
+    SolveRefusedError,
+    StorageError,
+)
+from slrig.failure import JobFailure, disk_errors
 from slrig.jobs.data_folder import BUNDLE, DataFolder
-from slrig.jobs.records import JobRecord, read_record
-from slrig.model import Calibration
+from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, read_record, utc_now
+from slrig.jobs.store import JobStore
+from slrig.model import Calibration, SequenceName, Size, SolveRecord
 from slrig.rig.session import ActiveCalibration
+from slrig.scan.plan import PatternPlan, ProgressCallback
+
+USUAL_PATTERNS = PatternPlan(sequence=SequenceName.ROBUST, rows=True)
+"""White, Gray code and line shift along both axes: the projector has columns and rows to be calibrated."""
+
+
+class SessionState(StrEnum):
+    """Where a session stands. Another pose opens a solved or failed one again."""
+
+    OPEN = "open"
+    SOLVING = "solving"
+    SOLVED = "solved"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class PoseRecord:
+    """One pose, as its job says. `number` counts from 1 within the session and is never given twice.
+
+    state : one that is accepted has succeeded. position : index of the pose that the positioner was asked for, None
+    where a person holds the board. answer : what was found of it, as JSON values, see `slrig.calibrate.report`;
+    None until read. fault : why it was refused or failed. seconds : from the last frame to the answer.
+    """
+
+    number: int
+    id: UUID
+    state: JobState
+    created_at: datetime
+    position: int | None = None
+    position_name: str | None = None
+    exposure_s: float | None = None
+    answer: Mapping[str, Any] | None = None
+    fault: JobFailure | None = None
+    seconds: float | None = None
+
+    @property
+    def name(self) -> str:
+        """As a person calls it, and as the solve names it.
+
+        >>> PoseRecord(3, UUID(int=0), JobState.QUEUED, datetime(2026, 11, 22)).name
+        'pose 3'
+        """
+        return f"pose {self.number}"
+
+    @property
+    def accepted(self) -> bool:
+        """Whether a solve takes it."""
+        return self.state is JobState.SUCCEEDED
+
+    @property
+    def refused(self) -> bool:
+        """Whether its frames show no pose that a solve could take."""
+        return self.fault is not None and self.fault.code == PoseRefusedError.code
+
+
+def pose_of(job: JobRecord) -> PoseRecord:
+    """The pose that a job is."""
+    found = job.summary or {}
+    return PoseRecord(
+        id=job.id,
+        state=job.state,
+        created_at=job.created_at,
+        answer=found.get("answer"),
+        fault=job.fault,
+        seconds=found.get("seconds"),
+        **{name: job.plan[name] for name in ("number", "position", "position_name", "exposure_s")},
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class SessionRecord:
+    """A calibration: of a session that shot poses, or imported.
+
+    number : rises with every calibration and orders lists. board : None where it was imported. cameras, projector :
+    the extents of the rig's devices, from the first pose on. latest_pose : the highest number given. state : on disk
+    never SOLVING. solve : the number of the last solve that went well, 0 before; result : its figures as JSON values.
+    script : positions that are still to be taken.
+
+    The last four are of its jobs, and not on disk. fault : of the last solve. progress : of what is under way.
+    under_way : whether a pose is being shot or read, or a solve runs.
+    """
+
+    number: int
+    id: UUID
+    created_at: datetime
+    rig: str
+    label: str | None = None
+    board: Board | None = None
+    patterns: PatternPlan = USUAL_PATTERNS
+    cameras: Mapping[str, Size] = field(default_factory=dict)
+    projector: Size | None = None
+    state: SessionState = SessionState.OPEN
+    latest_pose: int = 0
+    solve: int = 0
+    solved_at: datetime | None = None
+    result: Mapping[str, Any] | None = None
+    coverage: Mapping[str, Any] | None = None
+    next_move: Mapping[str, Any] | None = None
+    script: tuple[int, ...] = ()
+    poses: tuple[PoseRecord, ...] = ()
+    progress: JobProgress | None = None
+    fault: JobFailure | None = None
+    under_way: bool = False
+
+    @property
+    def accepted(self) -> tuple[PoseRecord, ...]:
+        """The poses that a solve takes."""
+        return tuple(pose for pose in self.poses if pose.accepted)
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """The board before the rig, and the extents of the devices; projector is None where only cameras are calibrated."""
+
+    board: Board
+    cameras: Mapping[str, Size]
+    projector: Size | None
+
+    @property
+    def sizes(self) -> Mapping[str, Size]:
+        """The extents of the devices, the projector among them where there is one."""
+        return self.cameras if self.projector is None else {**self.cameras, PROJECTOR: self.projector}
+
+
+def setting_of(record: SessionRecord) -> Setting:
+    """The setting of a session. Raises CalibrationStateError for an imported calibration, which has no board."""
+    if record.board is None:
+        message = f"Calibration {record.id} was imported and has no board. Open a new one to shoot poses."
+        raise CalibrationStateError(message)
+    return Setting(record.board, record.cameras, record.projector)
+
+
+def with_jobs(session: SessionRecord, jobs: Sequence[JobRecord]) -> SessionRecord:
+    """A session as it is on disk, completed by what its jobs, oldest first, say."""
+    poses = tuple(sorted((pose_of(job) for job in jobs if job.kind is JobKind.POSE), key=lambda pose: pose.number))
+    solves = [job for job in jobs if job.kind is JobKind.SOLVE]
+    running = [job for job in jobs if not job.state.final]
+    state = SessionState.SOLVING if any(not job.state.final for job in solves) else session.state
+    fault = solves[-1].fault if solves and state is SessionState.FAILED else None
+    progress = next((job.progress for job in running if job.state is not JobState.QUEUED), None)
+    return replace(session, state=state, poses=poses, progress=progress, fault=fault, under_way=bool(running))
+
+
+_session_adapter = TypeAdapter(SessionRecord)
+
+
+def session_json(session: SessionRecord) -> bytes:
+    """A session as JSON text, without what its jobs say."""
+    of_jobs = {"poses", "progress", "fault", "under_way"}
+    return _session_adapter.dump_json(session, indent=1, exclude=of_jobs) + b"\n"
+
+
+def session_from_json(text: bytes, source: str) -> SessionRecord:
+    """The inverse of `session_json`. Raises StorageError when it is not that."""
+    try:
+        return _session_adapter.validate_json(text)
+    except (ValidationError, InvalidInputError) as error:
+        message = f"{source} is not a calibration session as this version of slrig writes it: {error}"
+        raise StorageError(message) from error
+
+
+def plain(value: Any) -> Any:
+    """A value of dataclasses, arrays, tuples and mappings as JSON values; what JSON has no number for is null.
+
+    >>> import numpy as np
+    >>> plain({"a": np.array([1.5, np.nan]), "b": (Size(2, 3),)})
+    {'a': [1.5, None], 'b': [{'width_px': 2, 'height_px': 3}]}
+    """
+    return to_jsonable_python(value, inf_nan_mode="null", fallback=lambda array: array.tolist())
+
+
+_SOLVE_SHARE = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class ReadPose:
+    """One pose, as it was read: its observation, and how well each camera saw it."""
+
+    observation: PoseObservation
+    figures: Mapping[str, ViewQuality]
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationResult:
+    """A solved calibration with all that is told of it.
+
+    calibration : carries its own error (`solved`). odd_even : what the odd and the even poses differ by, solved apart,
+    against what is stated for that; None where there are too few.
+    """
+
+    solution: Solution
+    calibration: Calibration
+    expected: ExpectedError
+    verdict: Verdict
+    coverage: Coverage
+    odd_even: OddEven | None = None
+
+
+def solve_poses(
+    board: Board,
+    cameras: Mapping[str, Size],
+    projector: Size | None,
+    poses: Sequence[ReadPose],
+    /,
+    *,
+    progress: ProgressCallback = lambda _stage, _fraction, _detail: None,
+    earlier: Calibration | None = None,
+    board_shape: BoardShape = BoardShape.AUTO,
+    tolerance_mm: float | None = None,
+) -> CalibrationResult:
+    """Solve the poses, say how far the result may be trusted, and give it an identity.
+
+    cameras : the first one's frame becomes the world; one is enough, also without a projector. projector : None where
+    no light was captured. earlier : a calibration of the same devices, to compare the scale with. board_shape : whether
+    the board may be bowed. tolerance_mm : what a point of a scan may be wrong by in 95 of 100 places; None goes by the
+    volume.
+
+    Raises
+    ------
+    SolveRefusedError
+        The poses determine no calibration, or do not span a volume to state an error for.
+    """
+    # Late: the service knows these values, and loads no compiled kernel before somebody solves.
+    from slrig.calibration.accuracy import expected_error
+    from slrig.calibration.solving import solve
+
+    observed = tuple(pose.observation for pose in poses)
+    observations = Observations(board, cameras, projector, observed)
+    solution = solve(
+        observations,
+        progress=lambda stage, fraction, detail: progress(stage, _SOLVE_SHARE * fraction, detail),
+        board_shape=board_shape,
+    )
+    progress("expected error", _SOLVE_SHARE, "")
+    try:
+        expected = expected_error(solution, observations)
+    except CalibrationError as error:
+        raise SolveRefusedError(str(error)) from error
+    checked = compare_halves(solution, expected.grid_mm)
+    sizes = dict(cameras) if projector is None else {**cameras, PROJECTOR: projector}
+    used = [pose for pose in observed if pose.name not in solution.outliers]
+    covered = coverage(used, board, sizes)
+    solved = SolveRecord(
+        id=uuid4().hex[:12],
+        solved_at=utc_now().isoformat(timespec="seconds"),
+        covariance=solution.covariance,
+        volume_mm=expected.volume_mm,
+        expected_error_mm=expected.point_mm,
+        scale_sigma=solution.size.scale_sigma,
+    )
+    progress("done", 1.0, "")
+    scale = None if earlier is None else check_scale(solution, earlier, board)
+    return CalibrationResult(
+        solution=solution,
+        calibration=replace(solution.calibration, solved=solved),
+        expected=expected,
+        verdict=judge_calibration(
+            solution, expected, covered, checked, board=board, scale=scale, tolerance_mm=tolerance_mm
+        ),
+        coverage=covered,
+        odd_even=checked,
+    )
+
 
 SESSION = "session.json"
 CALIBRATION = "calibration.json"
@@ -257,3 +547,87 @@ def _read_reading(path: Path) -> ReadPose:
         message = f"{path} cannot be read ({error}). Drop that pose (DELETE …/pose/N) and shoot it again."
         raise StorageError(message) from error
     return ReadPose(PoseObservation(name, views, light), figures)
+
+
+_log = structlog.get_logger(__name__)
+
+
+class CalibrationRegister:
+    """Holds every session in memory, and each change of one on disk before it is seen.
+
+    jobs : the poses and the solves. `lock` may be held over several calls. Only the process that holds the data folder
+    makes one.
+    """
+
+    def __init__(self, store: CalibrationStore, jobs: JobStore) -> None:
+        self.store = store
+        self.jobs = jobs
+        self.lock = threading.RLock()
+        self._sessions = {session.id: session for session in store.load()}
+
+    def all(self) -> Sequence[SessionRecord]:
+        """Return every calibration, newest first."""
+        with self.lock:
+            sessions = sorted(self._sessions.values(), key=lambda session: session.number, reverse=True)
+            jobs = self.jobs.by_parent(JobKind.POSE, JobKind.SOLVE)
+        return [with_jobs(session, jobs.get(session.id, ())) for session in sessions]
+
+    def get(self, session_id: UUID) -> SessionRecord:
+        """Return a calibration. Raises CalibrationNotFoundError."""
+        with self.lock:
+            return with_jobs(self._session(session_id), self.jobs.of(session_id))
+
+    def pose(self, session_id: UUID, number: int) -> PoseRecord:
+        """Return a pose. Raises CalibrationNotFoundError."""
+        poses = {pose.number: pose for pose in self.get(session_id).poses}
+        if number not in poses:
+            numbers = ", ".join(str(each) for each in poses) or "none"
+            message = f"Calibration {session_id} has no pose {number}; its poses: {numbers}."
+            raise CalibrationNotFoundError(message)
+        return poses[number]
+
+    def add(self, session_id: UUID, rig: str, label: str | None, **fields: Any) -> SessionRecord:
+        """Put a new calibration on record, and return it. Raises StorageError."""
+        with self.lock:
+            number = max((session.number for session in self._sessions.values()), default=0) + 1
+            session = SessionRecord(number, session_id, utc_now(), rig, label, **fields)
+            self.store.create(session)
+            self._sessions[session_id] = session
+            return session
+
+    def remove(self, session_id: UUID) -> None:
+        """Forget a calibration with its jobs, and remove its files. Raises StorageError."""
+        with self.lock:
+            self.store.delete(session_id)
+            del self._sessions[session_id]
+        self.jobs.delete_of(session_id)
+
+    def change(self, session_id: UUID, *, must_last: bool = True, **fields: Any) -> None:
+        """Replace fields of a session, first on disk.
+
+        Where `must_last` is False, a disk that refuses leaves the change in memory alone, to be saved with the next:
+        the way something ended is not lost because the disk is full.
+
+        Raises CalibrationNotFoundError if it was deleted, StorageError if the disk refused and nothing has changed.
+        """
+        with self.lock:
+            before = self._session(session_id)
+            after = replace(before, **fields)
+            if after == before:
+                return
+            try:
+                self.store.save(after)
+            except StorageError as error:
+                if must_last:
+                    raise
+                _log.warning(
+                    "a change of a calibration is kept until the disk takes it",
+                    calibration=str(session_id), cause=str(error),
+                )  # fmt: skip
+            self._sessions[session_id] = after
+
+    def _session(self, session_id: UUID) -> SessionRecord:
+        if session_id not in self._sessions:
+            message = f"No calibration {session_id} is on record here. GET /calibration lists those that are."
+            raise CalibrationNotFoundError(message)
+        return self._sessions[session_id]

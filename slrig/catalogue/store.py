@@ -1,35 +1,201 @@
-"""The catalogue itself: a Postgres database that rigs share, or a SQLite file of one machine.
+"""The catalogue that rigs share: a Postgres database, or a SQLite file of one machine; and how a rig's records get
+there.
 
-Nothing here waits for long: a database that does not answer is given up after `PATIENCE_S`, and whoever asked is told.
+No call waits for long: a database that does not answer is given up after `PATIENCE_S`, and the caller gets an error.
 """
 
 from __future__ import annotations
 
+import importlib.metadata
 import logging
+import platform
 import ssl
 import struct
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from datetime import datetime, timedelta
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import structlog
 from alembic.util import CommandError
-from sqlalchemy import URL, Connection, Engine, create_engine, func, or_, select, text
+from sqlalchemy import (
+    URL,
+    BigInteger,
+    Connection,
+    DateTime,
+    Dialect,
+    Engine,
+    Float,
+    Identity,
+    Index,
+    Integer,
+    String,
+    TypeDecorator,
+    create_engine,
+    func,
+    or_,
+    select,
+    text,
+)
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.exc import TimeoutError as NoConnectionError
-from sqlalchemy.orm import aliased
+from sqlalchemy.orm import DeclarativeBase, Mapped, aliased, mapped_column
 
-from slrig.catalogue.fleet import SEEN_S, STOPPED, UNSEEN, Fleet, LastScan, RigStanding
-from slrig.catalogue.tables import CatalogueBase, FinishedJobRow, Moment, RigRow
+from slrig.calibrate.verification import RigHealth
 from slrig.config import ServiceSettings, is_loopback
-from slrig.errors import CatalogueError, ConfigError, ExtraMissingError
+from slrig.errors import CatalogueError, ConfigError, ExtraMissingError, StorageError
 from slrig.jobs.database import sqlite_engine, upgrade, writing
+from slrig.jobs.manager import JobManager, RigStatus
 from slrig.jobs.records import JobKind, JobState
+from slrig.jobs.store import Copies
+from slrig.jobs.worker import READY
 from slrig.printable import printable
-from slrig.schedule.receivers import secret_of
+from slrig.schedule.notices import secret_of
+
+
+class Moment(TypeDecorator[datetime]):
+    """A moment, in UTC. SQLite has no time zones, and keeps it without."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """See `TypeDecorator`."""
+        found = None if value is None else value.astimezone(UTC)
+        return found if found is None or dialect.name != "sqlite" else found.replace(tzinfo=None)
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """See `TypeDecorator`."""
+        return value if value is None or dialect.name != "sqlite" else value.replace(tzinfo=UTC)
+
+
+NUMBER = BigInteger().with_variant(Integer, "sqlite")
+"""Of rows. SQLite counts by itself in columns of type INTEGER alone."""
+
+
+class CatalogueBase(DeclarativeBase):
+    """Holds the metadata."""
+
+
+class RigRow(CatalogueBase):
+    """How a rig was at `seen_at`, by the catalogue's own clock. All else is by the rig's.
+
+    origin : machine and data folder of the service that writes the row. words : what it does, or why it cannot.
+    waiting : for the rig. computing : scans whose frames are computed with, or wait for that. uncopied : jobs that
+    ended and are not here yet. health : of its calibration, by what was verified last at `verified_at`.
+    """
+
+    __tablename__ = "rig"
+
+    name: Mapped[str] = mapped_column(String, primary_key=True)
+    origin: Mapped[str] = mapped_column(String)
+    host: Mapped[str] = mapped_column(String)
+    version: Mapped[str] = mapped_column(String)
+    started_at: Mapped[datetime] = mapped_column(Moment)
+    seen_at: Mapped[datetime] = mapped_column(Moment)
+    state: Mapped[str] = mapped_column(String)
+    words: Mapped[str] = mapped_column(String)
+    waiting: Mapped[int] = mapped_column(Integer)
+    computing: Mapped[int] = mapped_column(Integer)
+    uncopied: Mapped[int] = mapped_column(Integer)
+    health: Mapped[str] = mapped_column(String)
+    health_message: Mapped[str] = mapped_column(String)
+    verified_at: Mapped[datetime | None] = mapped_column(Moment)
+
+
+class FinishedJobRow(CatalogueBase):
+    """One job that ended; `number` is the order in which they came, of one rig the order in which they ended. What
+    each column holds `slrig.jobs.store.told` says.
+    """
+
+    __tablename__ = "finished_job"
+
+    number: Mapped[int] = mapped_column(NUMBER, Identity(), primary_key=True)
+    job: Mapped[str] = mapped_column(String, unique=True)
+    rig: Mapped[str] = mapped_column(String)
+    kind: Mapped[str] = mapped_column(String)
+    label: Mapped[str | None] = mapped_column(String)
+    parent: Mapped[str | None] = mapped_column(String)
+    state: Mapped[str] = mapped_column(String)
+    requested_by: Mapped[str | None] = mapped_column(String)
+    created_at: Mapped[datetime] = mapped_column(Moment)
+    started_at: Mapped[datetime | None] = mapped_column(Moment)
+    finished_at: Mapped[datetime] = mapped_column(Moment)
+    fault_code: Mapped[str | None] = mapped_column(String)
+    fault_message: Mapped[str | None] = mapped_column(String)
+    points: Mapped[int | None] = mapped_column(BigInteger)
+    triangles: Mapped[int | None] = mapped_column(BigInteger)
+    sigma_mm: Mapped[float | None] = mapped_column(Float)
+    computed_where: Mapped[str | None] = mapped_column(String)
+    computed_host: Mapped[str | None] = mapped_column(String)
+
+    __table_args__ = (
+        Index("ix_finished_job_rig", "rig", "kind", "number"),
+        Index("ix_finished_job_finished", "kind", "finished_at"),
+    )
+
+
+BEAT_S = 20.0
+"""How often a rig says how it is."""
+
+SEEN_S = 3 * BEAT_S
+"""Until when that is believed: one beat may be late, and one be lost."""
+
+STOPPED, UNSEEN = "stopped", "unseen"
+
+
+@dataclass(frozen=True, slots=True)
+class LastScan:
+    """The scan of a rig that ended last. error : why it failed, where it did."""
+
+    id: str
+    label: str | None
+    state: str
+    finished_at: datetime
+    error: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class RigStanding:
+    """A rig of the fleet. seen_s : how long ago it was seen, by the catalogue's clock. state : ready, busy, opening,
+    fault; stopped, where its service ended in good order; unseen, where it was not seen for a minute. What it does, its
+    backlog and its health are None or empty then: nobody knows. words : what it does, or why it cannot. waiting : for
+    the rig. computing : scans that are reconstructed, or wait for that. uncopied : ended jobs that are still to be
+    copied. verified_at : when its calibration was verified last. scans_of_day : that ended within 24 hours.
+    """
+
+    name: str
+    host: str
+    version: str
+    started_at: datetime
+    seen_at: datetime
+    seen_s: float
+    state: str
+    words: str
+    waiting: int | None
+    computing: int | None
+    uncopied: int | None
+    health: str | None
+    health_message: str
+    verified_at: datetime | None
+    last_scan: LastScan | None
+    scans_of_day: int
+    failed_of_day: int
+
+
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """The rigs that have a catalogue in common, by their names."""
+
+    catalogue: str
+    rigs: tuple[RigStanding, ...]
+
 
 PATIENCE_S = 5.0
 """For a connection, for each answer, and for a lock: on a network that works each takes milliseconds."""
@@ -300,3 +466,190 @@ def _cause(error: Exception) -> str:
     answer = root.args[0] if root.args else ""
     words = str(answer.get("M", "") if isinstance(answer, Mapping) else answer)
     return printable(words.replace("network error", "the connection was lost")).rstrip(".")
+
+
+BATCH = 200
+"""Jobs in one transaction, some hundred kB."""
+
+FIRST_WAIT_S = 1.0
+LONGEST_WAIT_S = 30.0
+"""Between tries. A thousand rigs whose catalogue is away then ask it thirty times a second."""
+
+_END_S = 1.0
+
+_log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Copying:
+    """How the copying goes. fault : why not, None while it does. waiting, oldest_s : jobs that are not copied, and how
+    long the oldest has waited.
+    """
+
+    fault: str | None
+    waiting: int
+    oldest_s: float
+
+
+class Copier:
+    """Tells the catalogue. Nothing waits for it, but `close`, for a second at most.
+
+    standing : gives how the rig is, by the columns of its row but for `seen_at` and `uncopied`. clock : seconds that
+    only grow.
+    """
+
+    def __init__(
+        self,
+        catalogue: Catalogue,
+        copies: Copies,
+        standing: Callable[[], Mapping[str, Any]],
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._catalogue = catalogue
+        self._copies = copies
+        self._standing = standing
+        self._clock = clock
+        self._opened = False
+        self._fault: str | None = "It was not reached yet"
+        self._failures = 0
+        self._beat_at_s = -float("inf")
+        self._told_uncopied = 0
+        self._left = threading.Event()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="slrig-catalogue", daemon=True)
+
+    def start(self) -> None:
+        """Begin to copy."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Say that the rig is stopped, and copy no more, if that goes quickly. Idempotent."""
+        self._ending.set()
+        self._copies.news.set()
+        if self._thread.is_alive():
+            self._thread.join(_END_S)
+        self._left.set()
+
+    def status(self) -> Copying:
+        """How it goes. Raises StorageError."""
+        return Copying(self._fault, *self._copies.waiting())
+
+    def fleet(self) -> Fleet:
+        """Every rig of the catalogue. Asks nothing of one that is away: raises CatalogueError at once."""
+        if self._fault is not None:
+            message = f"{self._fault}. This rig scans on, and tries again by itself."
+            raise CatalogueError(message)
+        with suppress(CatalogueError):
+            return self._catalogue.fleet()
+        # The connection may be older than the last start of the database, which says nothing of that.
+        self._catalogue.close()
+        try:
+            return self._catalogue.fleet()
+        except CatalogueError as error:
+            # Nobody else is to wait for it before it was reached again.
+            self._fault = str(error).rstrip(".")
+            self._copies.news.set()
+            raise
+
+    def step(self) -> float:
+        """Copy what waits, and say how the rig is, if that is due. Returns the seconds until it is due again.
+
+        Raises CatalogueError; StorageError, if the rig's own records refuse.
+        """
+        if not self._opened:
+            self._catalogue.open()
+            self._copy_what_it_lacks()
+            self._opened = True
+        # In the order in which they ended: a copy that was not noted as taken comes again, and makes no second row.
+        while not self._left.is_set() and (copies := self._copies.oldest(BATCH)):
+            self._catalogue.copy([each.job for each in copies])
+            if self._left.is_set():
+                break
+            self._copies.taken(copies)
+            self._say_how_it_is()
+        self._say_how_it_is()
+        return self._beat_at_s + BEAT_S - self._clock()
+
+    def _say_how_it_is(self, **other: Any) -> None:
+        """If that is due, or the backlog that was told last is gone."""
+        uncopied, _ = self._copies.waiting()
+        if other or self._clock() >= self._beat_at_s + BEAT_S or (self._told_uncopied and not uncopied):
+            self._catalogue.see({**self._standing(), "uncopied": uncopied, **other})
+            self._beat_at_s, self._told_uncopied = self._clock(), uncopied
+
+    def _copy_what_it_lacks(self) -> None:
+        """Bring up what ended before there was this catalogue, or what it lost: it may be an older backup of itself."""
+        ended = self._copies.ended()
+        for begin in range(0, len(ended), BATCH):
+            if self._left.is_set():
+                return
+            some = ended[begin : begin + BATCH]
+            lacking = set(some) - self._catalogue.known(some)
+            if lacking and (jobs := self._copies.of(lacking)):
+                self._catalogue.copy(jobs)
+
+    def _run(self) -> None:
+        while True:
+            self._copies.news.clear()
+            wait_s = self._tried()
+            if self._ending.is_set():
+                break
+            (self._copies.news if self._fault is None else self._ending).wait(wait_s)
+            if self._ending.is_set():
+                break
+        if self._fault is None:
+            with suppress(CatalogueError, StorageError):
+                self.step()
+                self._say_how_it_is(state=STOPPED, words="")
+        self._catalogue.close()
+
+    def _tried(self) -> float:
+        try:
+            wait_s = self.step()
+        except Exception as error:  # noqa: BLE001 - whatever it was, the next try may go well
+            known = isinstance(error, (CatalogueError, StorageError))
+            fault = str(error).rstrip(".") if known else f"The catalogue cannot be used: {type(error).__name__}"
+            wait_s = min(FIRST_WAIT_S * 2.0 ** min(self._failures, 30), LONGEST_WAIT_S)
+            self._failures += 1
+            if fault != self._fault:
+                _log.warning("the catalogue is not told of this rig", cause=fault, exc_info=not known)
+            self._fault, self._opened = fault, False
+            self._catalogue.close()
+            return wait_s
+        if self._fault is not None:
+            _log.info("the catalogue is told of this rig", catalogue=self._catalogue.address)
+        self._fault, self._failures = None, 0
+        return wait_s
+
+
+def standing(manager: JobManager, health_of: RigHealth, *, data: Path, started_at: datetime) -> dict[str, Any]:
+    """The columns of a rig's row, but for when it is seen and what is not copied. data : the service's folder."""
+    status = manager.status()
+    health, latest, _ = health_of.health()
+    state, words = _state(status)
+    return {
+        "name": status.rig,
+        "origin": f"{platform.node()}:{data}",
+        "host": platform.node(),
+        "version": importlib.metadata.version("slrig"),
+        "started_at": started_at,
+        "state": state,
+        "words": words,
+        "waiting": status.waiting,
+        "computing": len(status.computing),
+        "health": str(health.state),
+        "health_message": "; ".join(health.reasons),
+        "verified_at": None if latest is None else latest.at,
+    }
+
+
+def _state(status: RigStatus) -> tuple[str, str]:
+    """What a rig is at, and in words."""
+    if status.fault is not None:
+        return "fault", status.fault
+    if status.facts is None:
+        return "opening", status.opening
+    if status.reconstruction != READY and not status.preparing:
+        return "fault", status.reconstruction
+    return ("ready", "") if status.holder is None else ("busy", status.holder)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -13,6 +15,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from slrig.accept.evaluation import AcceptanceResult
+from slrig.accept.job import AcceptanceTests, PositionJob, required_calibration, scripted_config
 from slrig.accept.plan import (
     STEEL_PER_K,
     AcceptancePlan,
@@ -20,25 +24,29 @@ from slrig.accept.plan import (
     Certified,
     Limits,
     Step,
+    acceptance_plan,
     exact_artefacts,
+    rig_volume_mm,
     usual_limits,
 )
-from slrig.accept.positions import acceptance_plan, rig_volume_mm
 from slrig.accept.report import document
-from slrig.accept.running import Place, required_calibration, run_acceptance
-from slrig.accept.scene import scripted_config
-from slrig.accept.store import HTML, JSON
-from slrig.accept.verdicts import AcceptanceResult
+from slrig.accept.store import HTML, JSON, POSITIONS, AcceptanceState
 from slrig.calibration import Decision
 from slrig.cli.display import answered, progress_shown
+from slrig.cli.local import followed, local_manager
 from slrig.cli.options import AcceptanceOptions
 from slrig.config import RigConfig, read_rig
 from slrig.devices import Rig
 from slrig.discovery import open_rig
-from slrig.errors import InvalidInputError, ScanCancelledError, SlrigError
+from slrig.disk import storage_errors
+from slrig.errors import InvalidInputError, NothingToReconstructError, ScanCancelledError, ScanEvidenceError, SlrigError
+from slrig.failure import error_of
+from slrig.jobs.manager import JobManager
+from slrig.jobs.records import Holder
 from slrig.logs import set_up_console_logs
 from slrig.reports.page import begun
 
+_HOLDER = Holder("acceptance", "the plan of an acceptance test", None)
 _COLOURS = {Decision.PASSES: "green", Decision.UNDECIDED: "yellow", Decision.FAILS: "bold red"}
 
 
@@ -99,19 +107,29 @@ def accept(rig_file: Path, asked: AcceptanceOptions, *, output: Path, scripted: 
     Raises
     ------
     SlrigError
-        As `run_acceptance`, or the rig file is wrong or the rig cannot be opened.
+        As `measure_positions`, or the rig file is wrong or the rig cannot be opened.
     """
     set_up_console_logs()
     config = read_rig(rig_file)
     if asked.tolerance_mm is None:
         asked = replace(asked, tolerance_mm=config.tolerance_mm)
+    _require_free(output)
     console = Console(stderr=as_json)
     with TemporaryDirectory(prefix="slrig-acceptance-") as scratch:
         if scripted:
             config = moving(config, asked, Path(scratch))
-        with open_rig(config) as rig:
-            plan = plan_for(asked, rig)
-            result = _tested(rig, plan, output, scripted=scripted, console=console)
+        with local_manager(config, PositionJob) as manager:
+            plan = manager.lend(_HOLDER, lambda rig, _: plan_for(asked, rig.open()))
+            if scripted:
+                with progress_shown() as display:
+                    result = measure_positions(manager, plan, output, progress=display)
+            else:
+                count = f"{len(plan.steps)} positions, {len(plan.takes)} captures"
+                console.print(f"An acceptance test of {count}.", markup=False)
+                result = measure_positions(
+                    manager, plan, output, progress=_quiet, place=placed_by_hand(plan, console),
+                    again=partial(_print_again, console),
+                )  # fmt: skip
     if as_json:
         typer.echo((output / JSON).read_text(encoding="utf-8"), nl=False)
     else:
@@ -132,11 +150,13 @@ def moving(config: RigConfig, asked: AcceptanceOptions, folder: Path) -> RigConf
     return scripted_config(config, plan, folder)
 
 
-def placed_by_hand(plan: AcceptancePlan, console: Console, *, ask: Callable[[str], str] | None = None) -> Place:
-    """A `Place` that tells a person what to do and waits for Enter; q ends the test (ScanCancelledError)."""
+def placed_by_hand(
+    plan: AcceptancePlan, console: Console, *, ask: Callable[[str], str] | None = None
+) -> Callable[[Step], None]:
+    """Tells a person what to place, and waits for Enter; q ends the test (ScanCancelledError)."""
     names = [step.name for step in plan.steps]
 
-    def place(_rig: Rig, step: Step, /) -> None:
+    def place(step: Step) -> None:
         number = names.index(step.name) + 1
         console.print(Text.assemble((f"\n{number} of {len(names)}  ", "bold"), step.words))
         x, y, z = (float(each) for each in step.centre_mm)
@@ -146,6 +166,62 @@ def placed_by_hand(plan: AcceptancePlan, console: Console, *, ask: Callable[[str
             raise ScanCancelledError(message)
 
     return place
+
+
+def measure_positions(
+    manager: JobManager,
+    plan: AcceptancePlan,
+    output: Path,
+    *,
+    progress: Callable[[str, float, str], None],
+    place: Callable[[Step], None] | None = None,
+    again: Callable[[Step, SlrigError], None] = lambda _step, _error: None,
+) -> AcceptanceResult:
+    """Measure every position of a plan with the rig of a manager, and bring reports and points into `output`. What was
+    measured before an error is there, too.
+
+    place : has the artefact of a step placed; None has the rig's positioner do it. again : gets the error where an
+    artefact was not found or a frame contradicted its pattern; the artefact is placed again then.
+
+    Raises CalibrationError: the rig has none; UnsupportedByDeviceError: it has no positioner, or one that does not know
+    a position; NothingToReconstructError, ScanEvidenceError, DeviceError, StorageError, ScanCancelledError.
+    """
+    tests = AcceptanceTests(manager)
+    test = tests.open(lambda *_: plan).id
+    names = [step.name for step in plan.steps]
+    try:
+        if place is None:
+            tests.measure(test, wait=True, scripted=True)
+        while (record := tests.get(test).from_first_take()).state is not AcceptanceState.FINISHED:
+            step = (record.next_take or plan.takes[-1])[0]
+            if place is not None:
+                place(step)
+                tests.measure(test, wait=True, scripted=False)
+            job = manager.store.of(test)[-1]
+
+            def overall(stage: str, fraction: float, detail: str, done: int = names.index(step.name)) -> None:
+                progress(stage, (done + fraction) / len(names), detail)
+
+            ended = followed(manager, job.id, overall)
+            if ended.fault is not None:
+                error = error_of(ended.fault)
+                if place is None or not isinstance(error, (NothingToReconstructError, ScanEvidenceError)):
+                    raise error
+                again(step, error)
+        return tests.result(test)
+    finally:
+        measured = tests.folder(test)
+        for found in (*measured.glob(f"{POSITIONS}/*/*.npz"), *measured.glob(HTML), *measured.glob(JSON)):
+            place_of = output / found.relative_to(measured)
+            with storage_errors(output):
+                place_of.parent.mkdir(parents=True, exist_ok=True)
+                shutil.move(found, place_of)
+
+
+def _require_free(folder: Path) -> None:
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        message = f"{folder}: the results of an acceptance test go into a new folder, and this one is not empty"
+        raise InvalidInputError(message)
 
 
 def tell(result: AcceptanceResult, console: Console) -> None:
@@ -168,18 +244,8 @@ def tell(result: AcceptanceResult, console: Console) -> None:
     console.print(Text(f"The rig {result.decision.value}.", style=_COLOURS[result.decision]))
 
 
-def _tested(rig: Rig, plan: AcceptancePlan, output: Path, *, scripted: bool, console: Console) -> AcceptanceResult:
-    if scripted:
-        with progress_shown() as display:
-            return run_acceptance(rig, plan, output, progress=display, cancelled=lambda: False)
-    console.print(f"An acceptance test of {len(plan.steps)} positions, {len(plan.takes)} captures.", markup=False)
-
-    def again(step: Step, error: SlrigError) -> bool:
-        console.print(Text(f"{step.name}: {error}", style="red"))
-        return True
-
-    manual = placed_by_hand(plan, console)
-    return run_acceptance(rig, plan, output, progress=_quiet, cancelled=lambda: False, place=manual, again=again)
+def _print_again(console: Console, step: Step, error: SlrigError) -> None:
+    console.print(Text(f"{step.name}: {error}", style="red"))
 
 
 def _quiet(_stage: str, _fraction: float, _detail: str, /) -> None:

@@ -11,7 +11,17 @@ from urllib.parse import urlencode
 
 import typer
 
-from slrig.cli.options import AsJson, BoardArguments, Keys, ServiceOptions, Unit, by_beginning, grouped
+from slrig.cli.options import (
+    AsJson,
+    BoardArguments,
+    Keys,
+    RigOption,
+    ServiceOptions,
+    Unit,
+    by_beginning,
+    given,
+    grouped,
+)
 from slrig.errors import CalibrationNotFoundError, ConfigError, ServiceError
 
 if TYPE_CHECKING:
@@ -56,7 +66,7 @@ def board(
 
     The scales show whether the printer kept the size.
     """
-    from slrig.cli.boards import chosen_board, write_board
+    from slrig.cli.calibrate_local import chosen_board, write_board
 
     write_board(chosen_board(asked), output, page=page)
 
@@ -85,8 +95,7 @@ def solve(
 ) -> None:
     """Calibrate from recorded poses. Needs no service and no rig."""
     from slrig.calibration import BoardShape
-    from slrig.cli.boards import chosen_board
-    from slrig.cli.calibrate_solve import solve_folder
+    from slrig.cli.calibrate_local import chosen_board, solve_folder
 
     shape = BoardShape(board_shape)
     solve_folder(
@@ -124,16 +133,23 @@ def run(
         float | None, typer.Option(help="Exposure of every camera, seconds. Default: as the rig file says.")
     ] = None,
     service: ServiceOptions,
+    rig: RigOption = None,
+    data: Annotated[
+        Path | None, typer.Option(help="With --rig: folder of calibrations and scans. Default: that of slrig serve.")
+    ] = None,
 ) -> None:
     """Walk through a calibration with a running service.
 
-    Shoot, be told what to move and why, and solve.
+    Shoot, read what to move and why, and solve.
     """
-    from slrig.cli.boards import chosen_board
+    from slrig.cli.calibrate_local import chosen_board
     from slrig.cli.calibrate_walk import opened, walk
+    from slrig.cli.scan import client_of
+    from slrig.config import read_settings
 
     chosen = chosen_board(asked) if resume is None else None
-    with service.client() as client:
+    kept = None if rig is None else read_settings(None, **given(data_dir=data)).data_dir
+    with client_of(rig, service, kept) as client:
         walk(
             client,
             client.get(_path(client, str(resume)))
@@ -185,7 +201,7 @@ def list_stored(service: ServiceOptions, as_json: AsJson = False) -> None:
 @grouped
 def show(calibration: CalibrationId, service: ServiceOptions, as_json: AsJson = False) -> None:
     """Show how good a calibration is, or what its poses still lack."""
-    from slrig.cli.calibration_screen import tell_session
+    from slrig.cli.calibrate_walk import tell_session
     from slrig.cli.display import print_json
 
     with service.client() as client:
@@ -211,12 +227,11 @@ def check(
     """
     if Path(poses).is_dir():
         from slrig.calibration import BoardShape
-        from slrig.cli.boards import chosen_board
-        from slrig.cli.calibrate_solve import check_folder
+        from slrig.cli.calibrate_local import check_folder, chosen_board
 
         check_folder(Path(poses), chosen_board(asked), board_shape=BoardShape(board_shape), as_json=as_json)
         return
-    from slrig.cli.calibration_screen import checked, tell_check
+    from slrig.cli.calibrate_walk import checked, tell_check
     from slrig.cli.display import print_json
 
     with service.client() as client:
@@ -239,7 +254,7 @@ def compare(
 
     Tells what the second one says otherwise than the first.
     """
-    from slrig.cli.calibration_screen import tell_comparison
+    from slrig.cli.calibrate_walk import tell_comparison
     from slrig.cli.display import print_json
 
     with service.client() as client:
@@ -261,7 +276,7 @@ def light(
     from slrig.bundle import write_calibration
     from slrig.cli.display import progress_shown
     from slrig.cli.reconstruct import prepare_kernels
-    from slrig.scan.light_board import with_light_map
+    from slrig.scan.reconstruct import with_light_map
 
     with progress_shown() as display:
         prepare_kernels(display)

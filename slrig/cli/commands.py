@@ -1,4 +1,5 @@
 """slrig's commands and their exit codes: 0 well, 1 a defect of slrig, 2 something to be put right, 130 Ctrl-C.
+
 `slrig conform` exits with 1 for a defect of a driver, `slrig doctor` for one of the rig, `slrig verify` for a stale
 calibration, `slrig accept` for a test that is not passed, too.
 """
@@ -6,34 +7,243 @@ calibration, `slrig accept` for a test that is not passed, too.
 from __future__ import annotations
 
 import os
+import shlex
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 import typer.core
 
-from slrig.cli import calibrate, key, pool, preset, schedule, turntable
-from slrig.cli.backup import backup, restore
-from slrig.cli.fleet import fleet
-from slrig.cli.foreign import import_images
-from slrig.cli.model import model
+from slrig.cli import calibrate, schedule
+from slrig.cli.model import model, turntable_app
 from slrig.cli.options import (
     AcceptanceOptions,
     AsJson,
     BoardArguments,
+    Keys,
     MeshOptions,
     RigFile,
     RigHere,
+    RigOption,
+    ScanOptions,
     ServiceOptions,
+    Unit,
     given,
     grouped,
     period_option,
 )
-from slrig.cli.patterns import patterns
-from slrig.cli.scan_options import ScanOptions
-from slrig.cli.serve import serve
+from slrig.cli.service import Data, backup, fleet, key_app, pool_app, restore, serve, worker
 from slrig.errors import ConfigError, SlrigError
+
+if TYPE_CHECKING:
+    from slrig.importers import UnderstoodFolder
+
+
+def patterns(
+    rig: RigFile,
+    sequence: Annotated[
+        Literal["fast", "standard", "robust", "phase"] | None,
+        typer.Option(help="If scans ask for another than the rig file."),
+    ] = None,
+    period_px: Annotated[
+        int | None, typer.Option(help="Distance of two lines, or period of phase, if scans ask for another one.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(help="Frames of a sinusoid, if scans ask for other ones.")] = None,
+    line_width_px: Annotated[int | None, typer.Option(help="Width of a line, if scans ask for another one.")] = None,
+    gray_cell_px: Annotated[
+        int | None, typer.Option(help="Width of the finest Gray cell, if scans ask for another one.")
+    ] = None,
+) -> None:
+    """Write the patterns that a projector must hold.
+
+    For trigger boxes and light engines: all that scans, calibration, verification and the doctor show, each once.
+    """
+    asked = given(
+        sequence=sequence, line_width_px=line_width_px, gray_cell_px=gray_cell_px, sine_steps=steps,
+        **period_option(sequence, period_px),
+    )  # fmt: skip
+    typer.echo(written_patterns(rig, asked))
+
+
+def written_patterns(rig_file: Path, asked: Mapping[str, object]) -> str:
+    """Have the rig's projector write all that is shown on it, and return what to do with the files.
+
+    asked : patterns of scans, as far as they differ from the rig file's. Scans of either axis can be played, before and
+    after a calibration. Raises UnsupportedByDeviceError where the projector shows any pattern, what opening the rig and
+    what writing raises.
+    """
+    from dataclasses import replace
+
+    from slrig.api.schemas import PatternRequest, ScanRequest, scan_plan
+    from slrig.calibrate.store import USUAL_PATTERNS
+    from slrig.config import read_rig
+    from slrig.devices import StoredPatternProjector
+    from slrig.discovery import open_rig
+    from slrig.doctor import doctor_sequence
+    from slrig.errors import UnsupportedByDeviceError
+    from slrig.logs import set_up_console_logs
+    from slrig.patterns import merge_sequences
+    from slrig.scan.plan import pattern_sequence
+
+    set_up_console_logs()
+    config = read_rig(rig_file)
+    request = ScanRequest(patterns=PatternRequest.model_validate(asked))
+    with open_rig(config) as rig:
+        projector = rig.projector
+        if not isinstance(projector, StoredPatternProjector):
+            message = f"the projector of rig '{rig.name}' ({projector.info.model}) shows any pattern: nothing to flash"
+            raise UnsupportedByDeviceError(message)
+        size = projector.info.size
+        scans = replace(scan_plan(request, config.scan).patterns, rows=True)
+        sequences = (pattern_sequence(scans, size), pattern_sequence(USUAL_PATTERNS, size), doctor_sequence(size))
+        return projector.write_patterns(merge_sequences(sequences))
+
+
+def import_images(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FOLDER",
+            help="Folder of images, of one camera or with a subfolder for each; or a TIFF, .npy, .npz or video of all.",
+        ),
+    ],
+    output: Annotated[Path, typer.Option(help="The bundle to write: a new folder.")],
+    projector: Annotated[str, typer.Option(help="Columns x rows of the projector, as 1024x768.")],
+    program: Annotated[
+        Literal["opencv", "scan3d", "slstudio", "slstudio-micro"] | None,
+        typer.Option("--format", help="The program whose order numbered images have. Default: opencv."),
+    ] = None,
+    pattern: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WORDS",
+            help="Order of numbered images: white, black, columns, rows (each bit with its inverse, the most "
+            "significant first), columns-plain, rows-plain (without inverses), columns-sine:PERIOD/STEPS.",
+        ),
+    ] = None,
+    names: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TEMPLATE",
+            help="Names of images, as '{axis}_{bit:02}_{inverted}.png': fields axis, bit (0 the most significant) or "
+            "power (0 the least), inverted, camera; or '*_{number}_{camera}.png': * is anything, {number} the order, "
+            "and the images tell their patterns.",
+        ),
+    ] = None,
+    white: Annotated[
+        str | None, typer.Option(metavar="TEMPLATE", help="With --names: name of the white image.")
+    ] = None,
+    black: Annotated[
+        str | None, typer.Option(metavar="TEMPLATE", help="With --names: name of the black image.")
+    ] = None,
+    listed: Annotated[
+        Path | None,
+        typer.Option(
+            "--list",
+            metavar="FILE",
+            help="CSV of file, pattern, camera: white, 'column 3', 'row 0 inverted', 'column line 2 of 8 width 1'.",
+        ),
+    ] = None,
+    cell_px: Annotated[
+        int | None, typer.Option(min=1, help="Width of the finest Gray cell, projector pixels. Default: found, or 1.")
+    ] = None,
+    offset_px: Annotated[
+        int | None, typer.Option(min=0, help="Added to a position before it is cut into cells. Default: found, or 0.")
+    ] = None,
+    camera: Annotated[
+        list[str] | None, typer.Option(help="Name of a camera, in the order of their folders; may be repeated.")
+    ] = None,
+    bit_depth: Annotated[
+        int | None, typer.Option(min=1, max=16, help="Bits of a sample, right-aligned. Default: found in the images.")
+    ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            help="Calibration to put into the bundle, a file of any program or a folder of them. Default: "
+            "FOLDER/calibration.yml, .xml, .json, .npz, .mat."
+        ),
+    ] = None,
+    unit: Unit = None,
+    keys: Keys = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Take what was found in the images without a question.")] = False,
+    save_list: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write what was found as a CSV file for --list.")
+    ] = None,
+) -> None:
+    """Make a bundle of another program's images.
+
+    The images themselves tell which Gray codes, lines and sinusoids they show; a picture beside the bundle shows what
+    each was taken for. Or state the order of a program, or names. Then: slrig reconstruct.
+    """
+    from slrig.importers import ImageNaming, ProjectorCode, assign_images, import_capture, parse_size, write_list
+
+    ways = {"--format": program, "--pattern": pattern, "--names": names, "--list": listed}
+    asked = [way for way, value in ways.items() if value is not None]
+    if len(asked) > 1 or ((white or black) and names is None):
+        message = f"expected one of {', '.join(ways)}, and --white and --black with --names, found {', '.join(asked)}"
+        raise ConfigError(message)
+    if program is not None and program != "opencv" and (cell_px, offset_px) != (None, None):
+        message = (
+            f"--format {program}: expected no --cell-px and --offset-px, which its order says itself; say --pattern"
+        )
+        raise ConfigError(message)
+    naming = ImageNaming(program, pattern, names, white, black, listed)
+    code = ProjectorCode(parse_size(projector), cell_px=cell_px, offset_px=offset_px)
+    found = assign_images(folder, code, naming)
+    if save_list is not None:
+        write_list(save_list, folder, found)
+    if found.understood is not None:
+        _propose(found.understood, output.with_name(f"{output.name}-sheet.png"), yes=yes)
+    used = import_capture(
+        folder, output, code, found, names=camera or (), bit_depth=bit_depth, calibration_file=calibration, unit=unit,
+        keys=keys or (),
+    )  # fmt: skip
+    for name, files in found.cameras.items():
+        typer.echo(f"{'camera':<11}{name}: {len(files)} images, {files[0][0].name} to {files[-1][0].name}")
+    for note in found.notes:
+        typer.echo(f"{'taken':<11}{note}")
+    for fault in found.faults:
+        typer.echo(f"{'doubtful':<11}{fault}")
+    if found.unassigned:
+        some = ", ".join(found.unassigned[:5]) + (" …" if len(found.unassigned) > 5 else "")
+        typer.echo(f"{'left out':<11}{len(found.unassigned)} images that no pattern is known of: {some}")
+    typer.echo(f"{'bundle':<11}{output}")
+    words = ["slrig", "reconstruct", str(output), "--output", f"{output.name}-mesh"]
+    words += [] if used is not None else ["--decode-only"]
+    typer.echo(f"{'calibrated':<11}{used or 'no: it can only be decoded'}")
+    for note in found.calibration_notes:
+        typer.echo(f"{'':<11}{note}")
+    typer.echo(f"To go on: {shlex.join(words)}")
+
+
+def _propose(found: UnderstoodFolder, sheet: Path, *, yes: bool) -> None:
+    """Print and draw which pattern each image was found to show, and ask whether to go on.
+
+    Raises ConfigError: there are doubts, and no terminal to ask at.
+    """
+    from slrig.cli.rig_file import terminal
+    from slrig.importers import write_contact_sheet
+
+    write_contact_sheet(sheet, found)
+    for fact in found.facts:
+        typer.echo(f"{'found':<11}{fact}")
+    for doubt in found.doubts:
+        typer.echo(f"{'unsure':<11}{doubt}")
+    typer.echo(f"{'look at':<11}{sheet}")
+    if yes:
+        return
+    if terminal():
+        if not typer.confirm("Take the images for this?", default=not found.doubts):
+            raise typer.Exit(1)
+    elif found.doubts:
+        message = (
+            f"it is unsure what the images show: {'; '.join(found.doubts)}. Look at {sheet}; if it is right, add "
+            "--yes; otherwise describe the images by --format, --pattern, --names or --list"
+        )
+        raise ConfigError(message)
+
 
 INTERRUPTED = 130
 
@@ -93,7 +303,7 @@ def demo(
     Goes through the real service, in a process of its own. Exit code 1 if a thousandth of the mesh's area or more is
     beyond 1 mm of the truth, or shows the cameras its back.
     """
-    from slrig.cli.demo import run_demo
+    from slrig.cli.scan import run_demo
 
     run_demo(rig, output)
 
@@ -103,6 +313,7 @@ def demo(
 def scan(
     *,
     service: ServiceOptions,
+    rig: RigOption = None,
     output: Annotated[Path, typer.Option(help="Folder for the files of the scan.")] = Path("scans/latest"),
     file: Annotated[
         list[str] | None,
@@ -144,7 +355,7 @@ def scan(
     every_s: Annotated[float | None, typer.Option(help="From the start of one to that of the next, seconds.")] = None,
 ) -> None:
     """Scan with a running service, and fetch the mesh."""
-    from slrig.cli.scan import FILES, assisted, scan_with, series_with, tell_result
+    from slrig.cli.scan import FILES, assisted, client_of, scan_with, series_with, tell_result
 
     request = given(
         label=label,
@@ -165,7 +376,7 @@ def scan(
     files = tuple(file or FILES)
     if asked.budget_s is not None and not asked.assist:
         raise ConfigError("--budget-s: it is for --assist, which finds exposures within it. Give both, or neither.")
-    with service.client() as client:
+    with client_of(rig, service) as client:
         if asked.assist:
             request = assisted(client, request, budget_s=asked.budget_s)
         if repeat > 1:
@@ -217,11 +428,11 @@ def devices(
 ) -> None:
     """List installed drivers and the devices that are plugged in."""
     if options is not None:
-        from slrig.cli.driver_options import tell_options
+        from slrig.cli.rig_file import tell_options
 
         tell_options(options, as_json=as_json)
         return
-    from slrig.cli.devices import list_devices
+    from slrig.cli.rig_file import list_devices
 
     list_devices(as_json=as_json)
 
@@ -249,7 +460,7 @@ def init(
 
     Asks what it cannot know. Checks the file by the drivers before it is written; opens no device.
     """
-    from slrig.cli.init import init as write_rig_file
+    from slrig.cli.rig_file import init as write_rig_file
 
     write_rig_file(
         output,
@@ -276,7 +487,7 @@ def warm() -> None:
 
 @app.command()
 @grouped
-def conform(*, rig: RigHere = None, service: ServiceOptions, data: key.Data = None, as_json: AsJson = False) -> None:
+def conform(*, rig: RigHere = None, service: ServiceOptions, data: Data = None, as_json: AsJson = False) -> None:
     """Examine a rig by the driver contract, and score it.
 
     Exit code 1 unless every check that applies passes.
@@ -302,7 +513,7 @@ def latency(
         Literal["free", "software"] | None,
         typer.Option(help="How exposures are started. Default: free where a camera can."),
     ] = None,
-    data: key.Data = None,
+    data: Data = None,
     as_json: AsJson = False,
 ) -> None:
     """Flash the projector: how late is its light?
@@ -326,7 +537,7 @@ def doctor(
     output: Annotated[Path | None, typer.Option(help="Write a rig file with the values that were found.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file of --output.")] = False,
     search_s: Annotated[float, typer.Option(min=0.01, max=10, help="How late light may be, seconds.")] = 0.5,
-    data: key.Data = None,
+    data: Data = None,
     as_json: AsJson = False,
 ) -> None:
     """Examine a rig before a still object: what is wrong?
@@ -358,8 +569,8 @@ def verify(
 
     Exit code 1 if it is stale.
     """
-    from slrig.cli.boards import chosen_board
-    from slrig.cli.verify import verify as look
+    from slrig.cli.calibrate_local import chosen_board
+    from slrig.cli.calibrate_local import verify as look
 
     if not look(source, chosen_board(board), calibration, position=position, as_json=as_json):
         raise typer.Exit(1)
@@ -387,6 +598,60 @@ def accept(
         raise typer.Exit(1)
 
 
+preset_app = typer.Typer(no_args_is_help=True, help="Options of scans by name: for dark objects, for shiny ones.")
+
+Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the preset.")]
+MOST_BYTES = 2**20
+
+
+@preset_app.command(name="list")
+@grouped
+def list_presets(service: ServiceOptions, as_json: AsJson = False) -> None:
+    """List presets, and where they come from."""
+    from slrig.cli.display import print_json, print_table
+
+    with service.client() as client:
+        found = client.presets.list()
+    if as_json:
+        print_json(found)
+        return
+    rows = [(each["name"], each["source"], each["fault"] or each["description"] or "") for each in found["presets"]]
+    print_table(("preset", "from", "for"), rows)
+
+
+@preset_app.command()
+@grouped
+def export(name: Name, service: ServiceOptions) -> None:
+    """Print a preset as JSON, for a file that another rig imports."""
+    from slrig.cli.display import print_json
+
+    with service.client() as client:
+        print_json(client.presets.get(name))
+
+
+@preset_app.command(name="import")
+@grouped
+def import_preset(
+    name: Name,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A file that export wrote; - is standard input.")],
+    service: ServiceOptions,
+) -> None:
+    """Have the service keep a preset by this name."""
+    from slrig.bundle import read_text
+
+    document = sys.stdin.read(MOST_BYTES) if str(file) == "-" else read_text(file, MOST_BYTES, ConfigError)
+    with service.client() as client:
+        client.presets.put(name, document)
+
+
+@preset_app.command()
+@grouped
+def delete(name: Name, service: ServiceOptions) -> None:
+    """Delete a preset that was imported."""
+    with service.client() as client:
+        client.presets.delete(name)
+
+
 app.command()(serve)
 app.command()(model)
 app.command()(patterns)
@@ -395,11 +660,11 @@ app.command()(backup)
 app.command()(restore)
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(schedule.app, name="schedule")
-app.add_typer(preset.app, name="preset")
-app.add_typer(turntable.app, name="turntable")
-app.add_typer(key.app, name="key")
-app.add_typer(pool.app, name="pool")
-app.command()(pool.worker)
+app.add_typer(preset_app, name="preset")
+app.add_typer(turntable_app, name="turntable")
+app.add_typer(key_app, name="key")
+app.add_typer(pool_app, name="pool")
+app.command()(worker)
 app.command()(fleet)
 
 

@@ -1,4 +1,6 @@
-"""`slrig doctor`, `slrig conform`, `slrig latency`: a rig examined, and every finding in words."""
+"""`slrig doctor`, `slrig conform`, `slrig latency`: a rig examined by a manager of jobs in this process, or by the
+running service.
+"""
 
 from __future__ import annotations
 
@@ -27,12 +29,12 @@ from slrig.doctor import (
     DoctorJob,
     LatencyJob,
     Severity,
+    keep,
     latency_from_document,
     refuse_existing,
     write_rig_file,
 )
 from slrig.errors import ConfigError, StorageError
-from slrig.jobs.examinations import keep
 from slrig.jobs.job import Job
 from slrig.jobs.records import JobKind
 from slrig.logs import set_up_console_logs

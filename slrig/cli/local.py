@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from uuid import UUID
 
 from slrig.config import RigConfig
 from slrig.discovery import open_rig
@@ -15,11 +17,15 @@ from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.job import Job
 from slrig.jobs.manager import JobManager
-from slrig.jobs.records import JobRecord
+from slrig.jobs.records import JobRecord, JobState
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
-from slrig.rig.session import RigSession
+from slrig.model import Calibration
+from slrig.rig.session import ActiveCalibration, RigSession
 from slrig.scan.job import PIPELINE
+
+_LOOK_S = 0.5
+"""How often a command looks how far the kernels are."""
 
 
 @contextmanager
@@ -32,32 +38,52 @@ def local_manager(config: RigConfig, *kinds: type[Job]) -> Iterator[JobManager]:
         database = Database(data.database)
         rig = RigSession(config.name, lambda: open_rig(config))
         manager = JobManager(JobStore(database), data, rig, Worker(PIPELINE), *kinds)
+        # The command prints how a job ended.
+        log = logging.getLogger(JobManager.__module__)
+        level = log.level
+        log.setLevel(logging.ERROR)
         try:
             manager.start(prepare=False)
             yield manager
         finally:
             manager.close()
+            log.setLevel(level)
             database.close()
             data.release()
 
 
-def run_job(config: RigConfig, job: Job, progress: Callable[[str, float, str], None]) -> JobRecord:
-    """Do one job with the rig of a file, and return it when it is over.
+def run_job(
+    config: RigConfig, job: Job, progress: Callable[[str, float, str], None], calibration: Calibration | None = None
+) -> JobRecord:
+    """Do one job with the rig of a file, and return it when it is over. calibration : used in place of the rig's own.
 
-    Raises the error by which it ended, unless it left something on record: see its `fault` then.
+    Raises the error by which it ended, unless it left something on record: see its `fault` then. CalibrationError: the
+    calibration is for other devices.
     """
     with local_manager(config, type(job)) as manager:
-        job_id = manager.submit(job, wait=True)[0].id
-        news = threading.Event()
-        unwatch = manager.store.watch(job_id, news.set)
-        try:
-            while not (record := manager.store.get(job_id)).state.final:
-                at = record.progress
-                progress(at.stage, at.fraction, at.detail)
-                news.wait()
-                news.clear()
-        finally:
-            unwatch()
+        if calibration is not None:
+            manager.rig.use_calibration(ActiveCalibration("of the command", calibration))
+        record = followed(manager, manager.submit(job, wait=True)[0].id, progress)
     if record.fault is not None and record.summary is None:
         raise error_of(record.fault)
+    return record
+
+
+def followed(manager: JobManager, job_id: UUID, progress: Callable[[str, float, str], None]) -> JobRecord:
+    """Follow a job of a manager to its end, and return it."""
+    news = threading.Event()
+    unwatch = manager.store.watch(job_id, news.set)
+    try:
+        while not (record := manager.store.get(job_id)).state.final:
+            at = record.progress
+            preparing = record.state is JobState.COMPUTING and manager.worker.loading
+            if preparing:
+                progress("preparing", at.fraction, manager.worker.condition)
+            else:
+                progress(at.stage, at.fraction, at.detail)
+            # What the worker loads is no event.
+            news.wait(_LOOK_S if preparing else None)
+            news.clear()
+    finally:
+        unwatch()
     return record

@@ -17,19 +17,18 @@ from slrig.bundle import DESCRIPTION, read_turntable_angle
 from slrig.cli.display import answered, progress_shown
 from slrig.cli.reconstruct import prepare_kernels
 from slrig.client import Client
-from slrig.client.events import Progress
-from slrig.combine.plan import ShootPlan, StartingPoses, StatedAxis, TurntablePoses
-from slrig.combine.shooting import TURN
+from slrig.client.connection import Progress
 from slrig.config import read_rig
 from slrig.devices import Rig, Turntable
 from slrig.discovery import open_rig
 from slrig.errors import ConfigError, ServiceError, SlrigError, ViewsFailedError
 from slrig.jobs.records import utc_now
-from slrig.rig.turn_count import CountedTurntable
+from slrig.model_jobs.job import TURN
+from slrig.model_jobs.plan import ShootPlan, StartingPoses, StatedAxis, TurntablePoses
+from slrig.rig.session import CountedTurntable
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.artefacts import MESH
-from slrig.scan.plan import ScanPlan
-from slrig.scan.plan_check import no_turntable
+from slrig.scan.plan import ScanPlan, no_turntable
 from slrig.scan.reconstruct import reconstruct_bundle
 
 

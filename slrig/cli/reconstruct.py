@@ -1,35 +1,211 @@
-"""`slrig reconstruct`, recorded bundles become meshes in this process, and `slrig warm`, its kernels are compiled."""
+"""`slrig reconstruct`, which makes meshes of recorded bundles in this process, and `slrig warm`, which compiles its
+kernels.
+"""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from glob import glob
 from pathlib import Path
 from typing import Any
 
 import typer
 from rich.table import Column
 
-from slrig.bundle import read_calibration, read_description, write_file
-from slrig.cli.bundles import Row, named_bundles, work_through
-from slrig.cli.display import counted, progress_shown
-from slrig.cli.quality import quality_lines
+from slrig.bundle import DESCRIPTION, natural_sort_key, read_calibration, read_description, write_file
+from slrig.cli.display import ProgressDisplay, counted, print_table, progress_shown
+from slrig.cli.scan import quality_lines
+from slrig.disk import storage_errors
 from slrig.errors import ConfigError, ExtraMissingError
-from slrig.jobs.worker import prepare_kernel_cache
-from slrig.jobs.worker_wait import PREPARING
+from slrig.failure import UNEXPECTED, job_failure
+from slrig.jobs.worker import PREPARING, prepare_kernel_cache
 from slrig.logs import set_up_console_logs
 from slrig.scan.artefacts import MESH, ON_REQUEST, REPORT, write_converted
-from slrig.scan.offered import BUNDLE_ZIP, CALIBRATION_USED, missing_for, offered, on_demand
+from slrig.scan.formats import BUNDLE_ZIP, CALIBRATION_USED, missing_for, offered, on_demand
+from slrig.scan.job import report_summary
 from slrig.scan.plan import ProgressCallback, ReconstructionPlan
-from slrig.scan.records import report_summary
+
+Row = tuple[str, ...]
+"""What the table says of a bundle, or of one of its cameras, beside name and seconds; the last cell is a remark."""
+BUNDLE = "bundle"
+"""The folder of a scan's frames in that of the scan: it is the scan that has a name."""
+_MOST_NAMED = 5
+"""Names in one message."""
+
+
+def named_bundles(asked: Sequence[Path]) -> tuple[list[Path], bool]:
+    """The bundles that arguments name, each once, and whether each has a folder of its own for its results.
+
+    An argument is a bundle, a folder whose direct subfolders are bundles or scans with theirs, or a pattern that no
+    shell has expanded, as on Windows. Subfolders that are no bundles are told on stderr. Raises StorageError: a folder
+    cannot be read.
+    """
+    found: dict[Path, Path] = {}
+    several = False
+    for one in asked:
+        with storage_errors(one):
+            for path in matching(one):
+                inside = _bundles_inside(path)
+                several |= bool(inside)
+                found |= {bundle.absolute(): bundle for bundle in inside or [path]}
+    return list(found.values()), several or len(found) > 1
+
+
+def work_through(
+    bundles: Sequence[Path],
+    output: Path,
+    work: Callable[[Path, Path, ProgressCallback], Sequence[Row]],
+    *,
+    prepare: Callable[[ProgressCallback], object] = lambda _: None,
+    heads: Sequence[Column],
+    places: Sequence[str],
+) -> None:
+    """Work on each bundle, with progress, and print a table, whatever ends this.
+
+    Every description is read before the first bundle is worked on. One that fails is told at once; the others go on.
+
+    work : given a bundle, the folder for its results and the progress; returns rows. prepare : done once, if there is a
+    bundle to work on. heads : of the cells of a `Row` but the last. places : lines that say where results lie.
+
+    Raises
+    ------
+    ConfigError
+        Two results would have one name, or `output` cannot hold several. Nothing was done.
+    typer.Exit
+        A bundle failed: 2, or 1 if that is a defect of slrig.
+    """
+    _require_room(bundles, output)
+    done: dict[Path, list[Row]] = {}
+    failed: dict[Path, str] = {}
+    try:
+        with progress_shown() as display:
+            for bundle in bundles:
+                with _failure_told(bundle, failed, display):
+                    read_description(bundle)
+            if len(failed) < len(bundles):
+                prepare(display)
+            for place, bundle in enumerate(bundles, 1):
+                if bundle in failed:
+                    continue
+                name, began_s = _name(bundle), time.monotonic()
+                with _failure_told(bundle, failed, display):
+                    rows = work(bundle, output / name, _part_of(display, place, len(bundles), name))
+                    labels = [(name, f"{time.monotonic() - began_s:.1f}"), *[("", "")] * (len(rows) - 1)]
+                    done[bundle] = [
+                        (label, *row[:-1], taken, row[-1]) for (label, taken), row in zip(labels, rows, strict=True)
+                    ]
+    finally:
+        if done or failed:
+            _print_summary(bundles, done, failed, heads, places)
+    if failed:
+        raise typer.Exit(1 if UNEXPECTED in failed.values() else 2)
+
+
+def matching(asked: Path) -> list[Path]:
+    """What a pattern names, in natural order. A path stands for itself, and so does what matches nothing."""
+    matching = [] if asked.exists() else glob(str(asked))  # noqa: PTH207 - Path.glob takes no absolute pattern
+    return sorted(map(Path, matching), key=natural_sort_key) or [asked]
+
+
+def _bundles_inside(folder: Path) -> list[Path]:
+    """The bundles among the direct subfolders of a folder that is none itself, or those of scans among them, in natural
+    order.
+    """
+    if not folder.is_dir() or (folder / DESCRIPTION).is_file():
+        return []
+    inside = sorted((each for each in folder.iterdir() if each.is_dir() and each.name[0] != "."), key=natural_sort_key)
+    # A scan of the service has its bundle beside its results.
+    held = {each: [place for place in (each, each / BUNDLE) if (place / DESCRIPTION).is_file()][:1] for each in inside}
+    found = [place for places in held.values() for place in places]
+    skipped = [each.name for each, places in held.items() if not places]
+    if found and skipped:
+        typer.echo(f"{'skipped':<10}no {DESCRIPTION} in {_listed(skipped)} of {folder}", err=True)
+    return found
+
+
+def _name(bundle: Path) -> str:
+    """Name of the bundle's folder, or of the scan that holds it; "." and ".." are folders that have one."""
+    place = bundle if bundle.name not in ("", "..") else bundle.resolve()
+    if place.name == BUNDLE:
+        place = place.absolute().parent
+    return place.name or BUNDLE
+
+
+def _listed(names: Sequence[object]) -> str:
+    more = len(names) - _MOST_NAMED
+    return ", ".join(map(str, names[:_MOST_NAMED])) + (f" and {more} more" if more > 0 else "")
+
+
+def _require_room(bundles: Sequence[Path], output: Path) -> None:
+    """Refuse names of results that are equal, and a folder that holds something else (ConfigError)."""
+    by_name: dict[str, list[Path]] = {}
+    for bundle in bundles:
+        # Windows and macOS take names for equal that differ in case.
+        by_name.setdefault(_name(bundle).casefold(), []).append(bundle)
+    equal = [_listed(each) for each in by_name.values() if len(each) > 1]
+    if equal:
+        message = (
+            f"Results go into a folder of the bundle's name in {output}, and these have the same name: "
+            f"{'; '.join(equal)}. Rename their folders, or reconstruct them one by one, each with its own --output."
+        )
+        raise ConfigError(message)
+    if output.is_file() or (output / REPORT).exists():
+        what = "a file" if output.is_file() else f"the result of one ({REPORT} lies in it)"
+        message = (
+            f"--output {output}: expected a folder for results of several bundles, found {what}; name a new folder"
+        )
+        raise ConfigError(message)
+
+
+@contextmanager
+def _failure_told(bundle: Path, failed: dict[Path, str], display: ProgressDisplay) -> Iterator[None]:
+    """Tell the error that ends a bundle's work, and keep its code. An interruption goes on."""
+    try:
+        yield
+    except Exception as error:  # noqa: BLE001 - whatever it is, the other bundles are worked on
+        failure = job_failure(error)
+        words = failure.message if failure.code != UNEXPECTED else f"a defect of slrig\n{traceback.format_exc()}"
+        display.error(words if str(bundle) in words else f"{bundle}: {words}")
+        failed[bundle] = failure.code
+
+
+def _part_of(display: ProgressCallback, place: int, count: int, name: str) -> ProgressCallback:
+    """Progress of one bundle as that of all. place : 1 for the first."""
+
+    def told(stage: str, fraction: float, detail: str, /) -> None:
+        where = f"{place} of {count}: {name}"
+        display(stage, (place - 1 + fraction) / count, f"{where}, {detail}" if detail else where)
+
+    return told
+
+
+def _print_summary(
+    bundles: Sequence[Path],
+    done: Mapping[Path, Sequence[Row]],
+    failed: Mapping[Path, str],
+    heads: Sequence[Column],
+    places: Sequence[str],
+) -> None:
+    """Print a table of those that were begun, how many those are, and where results lie."""
+    blank = [""] * (len(heads) + 1)
+    rows = {**done, **{bundle: [(_name(bundle), *blank, f"failed: {code}")] for bundle, code in failed.items()}}
+    table = [row for bundle in bundles for row in rows.get(bundle, ())]
+    print_table((Column("bundle", overflow="fold"), *heads, Column("seconds", justify="right"), ""), table)
+    counts = {"done": len(done), "failed": len(failed), "not done": len(bundles) - len(rows)}
+    typer.echo(f"\n{'bundles':<10}{', '.join(f'{count} {what}' for what, count in counts.items() if count)}")
+    for line in places if done else ():
+        typer.echo(line)
 
 
 def decode_and_tell(asked: Sequence[Path], output: Path) -> None:
     """Decode bundles without a calibration, and print what was found and what to change. Raises as decoding does, and
     of several as `work_through` does.
     """
-    from slrig.scan.decoding_only import decode_bundle
+    from slrig.scan.reconstruct import decode_bundle
 
     set_up_console_logs()
     bundles, several = named_bundles(asked)
@@ -133,7 +309,7 @@ def _write_further(folder: Path, name: str, cameras: Sequence[str], bundle: Path
     """Write a file of a reconstruction that is made only when it is asked for. Raises as its maker does."""
     found = on_demand(name, cameras)
     if found is not None:
-        from slrig.scan.cloud_files import cloud_file
+        from slrig.scan.clouds import cloud_file
 
         write_file(folder / name, cloud_file(folder, *found, bundle=bundle, calibration=calibration))
     elif name in ON_REQUEST:

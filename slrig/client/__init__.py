@@ -1,6 +1,17 @@
 """The service's client for other people's Python: light to load, and typed."""
 
-from slrig.client.client import Client
-from slrig.client.results import Cloud, ScanJob, ScanResult
+from slrig.client.client import Client, Cloud, ScanJob, ScanResult
+from slrig.client.connection import Captured, Event, FileReady, PoseChange, Progress, StateChange
 
-__all__ = ["Client", "Cloud", "ScanJob", "ScanResult"]
+__all__ = [
+    "Captured",
+    "Client",
+    "Cloud",
+    "Event",
+    "FileReady",
+    "PoseChange",
+    "Progress",
+    "ScanJob",
+    "ScanResult",
+    "StateChange",
+]

@@ -1,17 +1,23 @@
-"""The client of a service."""
+"""The client of a service, a scan that runs, and the result of a scan that is done."""
 
 from __future__ import annotations
 
+import io
+import json
 import time
+from base64 import b64encode
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from html import escape
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeVar
 
 import httpx2
 
-from slrig.client.connection import Connection, Json, given
-from slrig.client.events import Event
+from slrig.client.connection import Connection, Event, Json, Progress, StateChange, given
+from slrig.client.errors import ScanFailedError
 from slrig.client.resources import (
     Acceptance,
     CalibrationResource,
@@ -27,8 +33,283 @@ from slrig.client.resources import (
     System,
     TurntableResource,
 )
-from slrig.client.results import ScanJob, ScanResult
-from slrig.errors import ServiceError
+from slrig.errors import ScanCancelledError, ServiceError
+
+if TYPE_CHECKING:
+    import numpy as np
+    import trimesh
+    from numpy.typing import NDArray
+
+    from slrig.client.connection import Picture
+
+    Floats: TypeAlias = NDArray[np.float32]
+    Bytes: TypeAlias = NDArray[np.uint8]
+
+_VIEWER = Path(__file__).with_name("viewer.html")
+_HEIGHT_PX = 420
+
+
+def shown(scan: Mapping[str, Any], coarse: bytes | None) -> str:
+    """HTML of a finished scan. coarse : coarse.glb, where it is at hand."""
+    rows = "".join(
+        f"<tr><th style='text-align:left'>{escape(name)}</th><td style='text-align:left'>{escape(value)}</td></tr>"
+        for name, value in _facts(scan)
+    )
+    table = f"<table>{rows}</table>"
+    if coarse is None:
+        return table
+    page = _VIEWER.read_text(encoding="utf-8").replace("@GLB@", b64encode(coarse).decode())
+    style = f"width:100%;height:{_HEIGHT_PX}px;border:0"
+    # An origin of its own, without the rights of the notebook's page.
+    return f"{table}<iframe sandbox='allow-scripts' style='{style}' srcdoc='{escape(page)}'></iframe>"
+
+
+def _facts(scan: Mapping[str, Any]) -> list[tuple[str, str]]:
+    mesh = (scan["summary"] or {}).get("mesh") or {}
+    figures, sigma, covers = mesh.get("figures"), mesh.get("sigma_mm"), mesh.get("covers_of_decoded")
+    parts = [
+        name.partition("-")[2].removesuffix(".png") for name in scan["links"]["files"] if name.startswith("causes-")
+    ]
+    facts = [("scan", f"{scan['label'] or ''} {scan['id']}".strip()), ("rig", f"{scan['rig']}: {', '.join(parts)}")]
+    if figures:
+        facts.append(("points", f"{figures['vertices']:,}"))
+        facts.append(("triangles", f"{figures['triangles']:,} on {figures['area_mm2'] / 100:,.1f} cm²"))
+    if sigma and sigma["p50"] is not None:
+        facts.append(("standard deviation", f"{sigma['p50']:.4f} mm, of 5 in 100 points above {sigma['p95']:.4f} mm"))
+        if mesh.get("sigma_holds"):
+            facts.append(("it holds", mesh["sigma_holds"]))
+    if covers is not None:
+        facts.append(("of the decoded pixels", f"{covers:.1%} are on the mesh"))
+    return [*facts, *(("note", note) for note in (scan["summary"] or {}).get("notes", ()))]
+
+
+T = TypeVar("T")
+_WAITING = {"queued": "waiting for the rig", "capturing": "preparing the rig", "computing": "reconstructing"}
+_COARSE = "coarse.glb"
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """The point of each pixel (row, column) of a camera: `points-CAMERA.npz` as arrays. NaN where there is none.
+
+    points_mm : (H, W, 3) float32, in the axes of the mesh. normals : (H, W, 3) float32. sigma_mm : (H, W) float32,
+    standard deviation along the normal. colour : (H, W, 3) uint8, sRGB. mark : (H, W) uint8, as albedo_mark of
+    mesh.ply. cause : (H, W) uint8, why a pixel has no point, 0 where it has one. causes : the name of each cause, by
+    its number.
+    """
+
+    camera: str
+    points_mm: Floats
+    normals: Floats
+    sigma_mm: Floats
+    colour: Bytes
+    mark: Bytes
+    cause: Bytes
+    causes: tuple[str, ...]
+
+    @classmethod
+    def read(cls, npz: bytes) -> Self:
+        """A cloud from the bytes of its file."""
+        import numpy as np
+
+        with np.load(io.BytesIO(npz), allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in cls.__dataclass_fields__}
+        camera, causes = str(arrays.pop("camera")), tuple(map(str, arrays.pop("causes")))
+        return cls(camera=camera, causes=causes, **arrays)
+
+    @cached_property
+    def albedo(self) -> Floats:
+        """(H, W, 3) float32: `colour` as light, 0 to 1 (IEC 61966-2-1), NaN where there is no point."""
+        import numpy as np
+
+        value = np.arange(256) / 255
+        light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
+        return np.where(self.cause[..., None] == 0, light[self.colour], np.float32(np.nan))
+
+
+class ScanResult:
+    """A finished scan. Files are fetched when they are first needed; arrays and the mesh are kept.
+
+    scan : its record. id : its id.
+    """
+
+    def __init__(self, connection: Connection, scan: Json) -> None:
+        self._connection = connection
+        self.scan = scan
+        self.id: str = scan["id"]
+        self._kept: dict[str, Any] = {}
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The names of the files that can be fetched."""
+        return tuple(self.scan["links"]["files"])
+
+    def cloud(self, camera: str | None = None) -> Cloud:
+        """The points of a camera; of the first camera of the rig unless one is named."""
+        found = [name for name in self.files if name.startswith("points-") and name.endswith(".npz")]
+        if camera is None and len(found) > 1:
+            # In the order of the rig.
+            found = [name for name in map(_cloud_file, self.report["cameras"]) if name in found]
+        return self._read(found[0] if camera is None and found else _cloud_file(camera or "CAMERA"), Cloud.read)
+
+    @property
+    def points_mm(self) -> Floats:
+        """(H, W, 3) float32, NaN where a pixel has no point; of the first camera, see `cloud`."""
+        return self.cloud().points_mm
+
+    @property
+    def normals(self) -> Floats:
+        """(H, W, 3) float32, of the first camera; see `cloud`."""
+        return self.cloud().normals
+
+    @property
+    def sigma_mm(self) -> Floats:
+        """(H, W) float32, standard deviation along the normal; of the first camera, see `cloud`."""
+        return self.cloud().sigma_mm
+
+    @property
+    def colour(self) -> Bytes:
+        """(H, W, 3) uint8, sRGB, of the first camera; see `cloud`."""
+        return self.cloud().colour
+
+    @property
+    def albedo(self) -> Floats:
+        """(H, W, 3) float32, light from 0 to 1, of the first camera; see `cloud`."""
+        return self.cloud().albedo
+
+    @property
+    def cause(self) -> Bytes:
+        """(H, W) uint8: why a pixel of the first camera has no point, 0 where it has one; see `causes`."""
+        return self.cloud().cause
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """The names of the numbers in `cause`."""
+        return self.cloud().causes
+
+    @property
+    def mesh(self) -> trimesh.Trimesh:
+        """The mesh in mm, with `vertex_attributes` such as sigma_mm."""
+        return self._read("mesh.ply", _read_mesh)
+
+    @property
+    def report(self) -> Json:
+        """report.json: figures, faults and causes."""
+        report: Json = self._read("report.json", json.loads)
+        return report
+
+    def image(self, name: str) -> Picture:
+        """A PNG of the scan as an array, such as preview.png."""
+        return self._connection.picture(self._path(name))
+
+    def fetch(self, name: str, path: str | Path) -> None:
+        """Write a file of the scan to a path, whole or not at all."""
+        self._connection.fetch(self._path(name), Path(path))
+
+    def save(self, name: str, folder: str | Path) -> Path:
+        """Write a file of the scan into a folder, and return its path."""
+        target = Path(folder) / Path(name).name
+        self._connection.fetch(self._path(name), target)
+        return target
+
+    def pin(self, *, pinned: bool = True) -> None:
+        """Keep the scan, even where the settings delete old ones; with pinned=False, no longer."""
+        self._connection.send("PUT" if pinned else "DELETE", f"{self.scan['links']['self']}/pin")
+
+    def delete(self) -> None:
+        """Delete the scan with all its files."""
+        self._connection.send("DELETE", self.scan["links"]["self"])
+
+    def _read(self, name: str, read: Callable[[bytes], T]) -> T:
+        if name not in self._kept:
+            self._kept[name] = read(self._connection.send("GET", self._path(name)).content)
+        kept: T = self._kept[name]
+        return kept
+
+    def _path(self, name: str) -> str:
+        files = self.scan["links"]["files"]
+        if name not in files:
+            message = f"The scan has no {name}. It has: {', '.join(files)}."
+            raise ServiceError(message)
+        return str(files[name])
+
+    def __repr__(self) -> str:
+        return f"<scan {self.id}, {self.scan['state']}>"
+
+    def _repr_html_(self) -> str:
+        """For a notebook: a table, and the mesh in 3-D, which loads nothing from elsewhere."""
+        return shown(self.scan, self._read(_COARSE, bytes) if _COARSE in self.files else None)
+
+
+class ScanJob:
+    """A scan that was started. Iterating yields its events, until it is done.
+
+    scan : its record when it was started. id : its id.
+    """
+
+    def __init__(self, connection: Connection, scan: Json) -> None:
+        self._connection = connection
+        self.scan = scan
+        self.id: str = scan["id"]
+
+    def __iter__(self) -> Iterator[Event]:
+        return self._connection.follow(self.scan["links"]["events"])
+
+    def cancel(self) -> None:
+        """Stop the scan between two frames."""
+        self._connection.send("POST", self.scan["links"]["cancel"])
+
+    def result(self, progress: ProgressCallback | None = None) -> ScanResult:
+        """Wait for the end, and return the result.
+
+        Raises
+        ------
+        ScanFailedError
+            The scan ended without a mesh.
+        ScanCancelledError
+            Another client cancelled it.
+        ServiceError
+            The service is gone, or refused.
+        """
+        fraction = 0.0
+        for event in self:
+            if progress and isinstance(event, Progress):
+                fraction = event.fraction
+                progress(event.stage, fraction, event.detail)
+            elif progress and isinstance(event, StateChange) and event.state in _WAITING:
+                progress(_WAITING[event.state], fraction, "")
+        scan = self._connection.json("GET", self.scan["links"]["self"])
+        if scan["state"] == "cancelled":
+            message = f"Scan {self.id} was cancelled by another client."
+            raise ScanCancelledError(message)
+        if scan["state"] != "succeeded":
+            raise ScanFailedError(scan)
+        return ScanResult(self._connection, scan)
+
+    def series(self) -> list[ScanJob]:
+        """All scans of its series, itself included."""
+        series = self.scan["links"].get("series")
+        if series is None:
+            return [self]
+        return [ScanJob(self._connection, scan) for scan in self._connection.json("GET", series)["scans"]]
+
+    def __repr__(self) -> str:
+        return f"<scan {self.id}>"
+
+
+def _cloud_file(camera: str) -> str:
+    return f"points-{camera}.npz"
+
+
+def _read_mesh(ply: bytes) -> trimesh.Trimesh:
+    import trimesh
+
+    mesh = trimesh.load_mesh(io.BytesIO(ply), file_type="ply", process=False)
+    stored = mesh.metadata.pop("_ply_raw")["vertex"]["data"]
+    for name in ("sigma_mm", "stripe", "albedo_mark"):
+        mesh.vertex_attributes[name] = stored[name].reshape(-1)
+    mesh.units = "mm"
+    return mesh
 
 
 class Client:

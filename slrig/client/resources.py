@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, Unpack
 
-from slrig.client.connection import Json, Resource, document_body, given, path
+from slrig.client.connection import Event, Json, Progress, Resource, document_body, given, path
 from slrig.client.errors import ExaminationFailedError, ModelFailedError, RefusedError
-from slrig.client.events import Event, Progress
 
 if TYPE_CHECKING:
     from slrig.client.connection import Picture

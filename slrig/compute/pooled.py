@@ -1,39 +1,418 @@
-"""A worker that has bundles reconstructed by a pool, and by this machine's own process whenever that fails.
+"""A worker that has bundles reconstructed by a pool over TLS, and by this machine's own process whenever that fails.
 
-What is on record, and in staging, is the rig's: a pool only ever gives files back, and an answer that comes late
-belongs to nobody. So each scan has one result, whatever is lost in the middle.
+Records and staging folders are the rig's: a pool only gives files back, and a late answer is ignored. So each scan has
+one result, even if a machine is lost in the middle.
 """
 
 from __future__ import annotations
 
+import asyncio
+import logging
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from datetime import datetime, timedelta
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
+from urllib.parse import urlsplit
 from uuid import uuid4
 
+import dask
+import distributed
 import structlog
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from distributed import Client, Security
 
-from slrig.compute.cluster import Cluster, DaskCluster
-from slrig.compute.host import POOL_FAULT, PoolRequest, PoolResponse
-from slrig.compute.security import pool_security
-from slrig.compute.store import PoolError, PoolStore, open_store
-from slrig.config import ServiceSettings
+from slrig.bundle import write_file
+from slrig.compute.host import (
+    CONNECT_S,
+    POOL_FAULT,
+    PoolError,
+    PoolRequest,
+    PoolResponse,
+    PoolStore,
+    compute,
+    join_logs,
+    open_store,
+    resource,
+)
+from slrig.config import ServiceSettings, is_loopback, read_private_text
 from slrig.disk import storage_errors
-from slrig.errors import ConfigError, ScanCancelledError, StorageError
-from slrig.jobs.compute import Compute
+from slrig.errors import ConfigError, ExtraMissingError, ScanCancelledError, StorageError
 from slrig.jobs.data_folder import BUNDLE, RESULT
-from slrig.jobs.frame_feed import FrameFeed
-from slrig.jobs.versions import versions
-from slrig.jobs.worker import Worker
-from slrig.jobs.worker_process import Task
-from slrig.jobs.worker_wait import POLL_S, Made, Told
+from slrig.jobs.database import versions
+from slrig.jobs.job import FrameFeed
+from slrig.jobs.records import utc_now
+from slrig.jobs.worker import POLL_S, Compute, Made, Task, Told, Worker
 from slrig.model import Region
+
+if TYPE_CHECKING:
+    from distributed import Security
+
+AUTHORITY, CERTIFICATE, KEY = "authority.pem", "certificate.pem", "key.pem"
+
+
+def require_pool_extra() -> None:
+    """Raise ExtraMissingError unless the libraries of a pool are installed."""
+    if missing := [name for name in ("cryptography", "distributed", "obstore") if find_spec(name) is None]:
+        message = f"A pool needs {' and '.join(missing)}, not installed here: pip install 'slrig[pool]'"
+        raise ExtraMissingError(message)
+
+
+def pool_security(address: str, certificates: Path | None) -> Security | None:
+    """What a member of the pool at `address` shows and asks for; None on this machine alone, without encryption.
+
+    Raises
+    ------
+    ConfigError
+        The address is none, or others could reach it without a certificate; or the certificates cannot be used.
+    """
+    parts = urlsplit(address)
+    try:
+        port = parts.port
+    except ValueError:
+        port = None
+    if parts.scheme not in {"tls", "tcp"} or not parts.hostname or port is None:
+        message = f"'{address}' is no address of a pool's scheduler: expected tls://HOST:PORT, such as tls://pool:8786."
+        raise ConfigError(message)
+    if parts.scheme == "tcp":
+        if not is_loopback(parts.hostname):
+            message = (
+                f"{address}: whoever reaches a pool without encryption can run any code on its machines. Use tls://, "
+                "with certificates that slrig pool certificates makes; tcp:// is for 127.0.0.1 alone."
+            )
+            raise ConfigError(message)
+        return None
+    if certificates is None:
+        message = f"{address}: expected the folder with this machine's certificates, found none; name it."
+        raise ConfigError(message)
+    files = [certificates / name for name in (AUTHORITY, CERTIFICATE, KEY)]
+    if missing := [file.name for file in files if not file.is_file()]:
+        message = (
+            f"{certificates} lacks {', '.join(missing)}. Name the folder of one machine that slrig pool certificates "
+            "made, such as its folder 'worker'."
+        )
+        raise ConfigError(message)
+    read_private_text(certificates / KEY, "the key of this machine's certificate")
+    from distributed import Security
+
+    authority, certificate, key = map(str, files)
+    # One certificate per machine, whatever its part.
+    return Security(
+        require_encryption=True,
+        tls_ca_file=authority,
+        tls_client_cert=certificate,
+        tls_client_key=key,
+        tls_worker_cert=certificate,
+        tls_worker_key=key,
+        tls_scheduler_cert=certificate,
+        tls_scheduler_key=key,
+    )
+
+
+AUTHORITY_KEY = "authority-key.pem"
+"""Whoever has it can join the pool; it stays where it was made."""
+
+AUTHORITY_DAYS, MACHINE_DAYS = 3650, 825
+"""825 days is the longest that systems take a server's certificate for (CA/Browser Forum, ballot 193)."""
+
+LONGEST_NAME = 64
+"""Of a common name in a certificate: RFC 5280, ub-common-name."""
+
+_CLOCKS = timedelta(hours=1)
+"""How far the clock of a machine may be behind."""
+
+
+def make_certificates(folder: Path, names: Sequence[str]) -> list[Path]:
+    """Make an authority in `folder`, unless it is there, and for each name a folder with what `pool_security` reads.
+    Returns those that were made; one that is there stays as it is.
+
+    Raises
+    ------
+    ConfigError
+        A name is no name for a folder, or the authority's files cannot be read.
+    StorageError
+        The disk refused.
+    """
+    for name in names:
+        if not name.replace("-", "").replace("_", "").isalnum() or len(name) > LONGEST_NAME:
+            message = (
+                f"'{name}' is no name for a machine: expected letters, digits, - and _, {LONGEST_NAME} of them at "
+                "most, such as rig-7."
+            )
+            raise ConfigError(message)
+    with storage_errors(folder):
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    key_path, certificate_path = folder / AUTHORITY_KEY, folder / AUTHORITY
+    if not key_path.exists():
+        key = ec.generate_private_key(ec.SECP256R1())
+        authority = _certificate("slrig pool", key.public_key(), None, key)
+        _write_key(key_path, key)
+        write_file(certificate_path, authority.public_bytes(serialization.Encoding.PEM))
+    key, authority = _authority(key_path, certificate_path)
+    made = []
+    for name in names:
+        place = folder / name
+        if (place / CERTIFICATE).exists():
+            continue
+        with storage_errors(place):
+            place.mkdir(mode=0o700, exist_ok=True)
+        own = ec.generate_private_key(ec.SECP256R1())
+        _write_key(place / KEY, own)
+        write_file(place / AUTHORITY, authority.public_bytes(serialization.Encoding.PEM))
+        shown = _certificate(name, own.public_key(), authority, key)
+        write_file(place / CERTIFICATE, shown.public_bytes(serialization.Encoding.PEM))
+        made.append(place)
+    return made
+
+
+def _authority(key_path: Path, certificate_path: Path) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
+    try:
+        text = read_private_text(key_path, f"the authority's key {key_path}")
+        key = serialization.load_pem_private_key(text.encode(), password=None)
+        authority = x509.load_pem_x509_certificate(certificate_path.read_bytes())
+    except (OSError, ValueError, TypeError) as cause:
+        message = f"{certificate_path.parent} holds no authority that can be used. Choose a new folder."
+        raise ConfigError(message) from cause
+    if not isinstance(key, ec.EllipticCurvePrivateKey) or authority.public_key() != key.public_key():
+        message = f"{key_path} is not the key of {certificate_path}. Choose a new folder."
+        raise ConfigError(message)
+    return key, authority
+
+
+def _certificate(
+    name: str, key: ec.EllipticCurvePublicKey, issuer: x509.Certificate | None, signer: ec.EllipticCurvePrivateKey
+) -> x509.Certificate:
+    """A certificate of a key; without an issuer it is an authority's own. RFC 5280."""
+    now, subject = utc_now(), x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    own = issuer is None
+    last: datetime = now + timedelta(days=AUTHORITY_DAYS if own else MACHINE_DAYS)
+    unused = ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement", "encipher_only")
+    usage = dict.fromkeys((*unused, "decipher_only"), False)
+    builder = (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(subject if issuer is None else issuer.subject)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _CLOCKS)
+        .not_valid_after(last if issuer is None else min(last, issuer.not_valid_after_utc))
+        .add_extension(x509.BasicConstraints(ca=own, path_length=0 if own else None), critical=True)
+        .add_extension(
+            x509.KeyUsage(digital_signature=not own, key_cert_sign=own, crl_sign=own, **usage), critical=True
+        )
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False)
+    )
+    if not own:
+        # In a pool each connects, and is connected to.
+        both = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
+        builder = builder.add_extension(x509.ExtendedKeyUsage(both), critical=False)
+    return builder.sign(signer, hashes.SHA256())
+
+
+def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
+    text = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    with storage_errors(path):
+        path.touch(mode=0o600)
+        path.write_bytes(text)
+
+
+CLOSE_S = 1.0
+"""How long a connection may take to be closed."""
+
+LOOK_S = 2.0
+"""How often the connection is looked at."""
+
+ASK_S = 30.0
+"""How often what the workers can do is asked for, unless their number changes. A scheduler tells it in 0.7 kB and 6 µs
+for each: at every look of 1 000 rigs, 320 workers would take its whole core and 0.9 Gbit/s."""
+
+NewsCallback = Callable[[Mapping[str, Any]], None]
+"""Is told what a machine tells of an order; without a stage, that it is at work."""
+
+
+class Cluster(Protocol):
+    """A pool as a rig sees it: `DaskCluster`, or what a test puts in its place.
+
+    topic : `Order.topic` of this rig. fault : why no order can be given, as of late.
+    """
+
+    topic: str
+    fault: str
+
+    def start(self) -> None:
+        """Begin to connect. Returns at once. Idempotent."""
+        ...
+
+    def usable(self, timeout_s: float = 0.0) -> bool:
+        """Wait at most so long until orders can be given; return whether they can."""
+        ...
+
+    def submit(self, order: PoolRequest, told: NewsCallback) -> Future[PoolResponse]:
+        """Give an order, which ends where the future is cancelled before it has begun. Its exception is a PoolError, or
+        CancelledError where the pool is gone. Raises PoolError.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let the pool go. Idempotent."""
+        ...
+
+
+class DaskCluster:
+    """The pool whose scheduler is at `address`. security : see `slrig.compute.pooled.pool_security`."""
+
+    def __init__(self, address: str, security: Security | None) -> None:
+        self.topic = f"slrig-{uuid4().hex}"
+        self.fault = f"the pool {address} has not answered yet"
+        self._address = address
+        self._security = security
+        self._resource = resource(versions())
+        self._usable = threading.Event()
+        self._starting = threading.Lock()
+        self._thread: threading.Thread | None = None
+        # Of that thread: dask's client is used on it alone.
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._life: asyncio.Task[None] | None = None
+        self._client: Client | None = None
+        self._told: dict[str, NewsCallback] = {}
+
+    def start(self) -> None:
+        """See `Cluster`."""
+        with self._starting:
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._live, name="slrig-pool", daemon=True)
+                self._thread.start()
+
+    def usable(self, timeout_s: float = 0.0) -> bool:
+        """See `Cluster`."""
+        return self._usable.wait(timeout_s)
+
+    def submit(self, order: PoolRequest, told: NewsCallback) -> Future[PoolResponse]:
+        """See `Cluster`."""
+        if self._loop is None or not self._usable.is_set():
+            raise PoolError(self.fault)
+        self._told[order.job] = told
+        return asyncio.run_coroutine_threadsafe(self._answer(order), self._loop)
+
+    def close(self) -> None:
+        """See `Cluster`."""
+        if self._thread is not None and self._loop is not None and self._life is not None:
+            with suppress(RuntimeError):  # it has ended
+                self._loop.call_soon_threadsafe(self._life.cancel)
+            self._thread.join(2 * CLOSE_S)
+
+    def _live(self) -> None:
+        join_logs()
+        # A rig computes by itself while it has no connection, and says so once.
+        for name in ("distributed", "tornado"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+        # dask's client asks for the same that `_watch` asks for.
+        dask.config.set({"distributed.client.scheduler-info-interval": "1 day"})
+        with suppress(asyncio.CancelledError):
+            asyncio.run(self._keep_connected())
+
+    async def _keep_connected(self) -> None:
+        self._loop, self._life = asyncio.get_running_loop(), asyncio.current_task()
+        while True:
+            client: Client | None = None
+            try:
+                # Reads the certificates, every time: they may have been renewed.
+                client = Client(
+                    self._address, security=self._security, timeout=CONNECT_S, asynchronous=True, set_as_default=False
+                )
+                await asyncio.wait_for(client, CONNECT_S)
+                client.subscribe_topic(self.topic, self._hear)
+                self._client = client
+                await self._watch(client)
+            except Exception as error:  # noqa: BLE001 - whatever it is, this machine computes
+                self._note(f"the pool {self._address} does not answer ({type(error).__name__})")
+            finally:
+                self._client = None
+                self._usable.clear()
+                if client is not None:
+                    with suppress(Exception):
+                        await client.close(timeout=CLOSE_S)
+                    # One whose network is gone cannot be closed, and would try again when it is forgotten.
+                    client.status = "closed"
+            await asyncio.sleep(LOOK_S)
+
+    async def _watch(self, client: Client) -> None:
+        """Look at the pool until it does not answer, which raises."""
+        known, asked_s, lack = -1, 0.0, None
+        while True:
+            found = await asyncio.wait_for(self._identity(client, 0), CONNECT_S)
+            now_s = asyncio.get_running_loop().time()
+            if found["n_workers"] != known or now_s - asked_s >= ASK_S:
+                found = await asyncio.wait_for(self._identity(client, -1), CONNECT_S)
+                known, asked_s, lack = found["n_workers"], now_s, self._lack(found["workers"].values())
+            self._note(lack)
+            await asyncio.sleep(LOOK_S)
+
+    @staticmethod
+    async def _identity(client: Client, workers: int) -> Mapping[str, Any]:
+        """What the scheduler tells of itself, and of so many workers; -1: of all."""
+        scheduler: Any = client.scheduler
+        found: Mapping[str, Any] = await scheduler.identity(n_workers=workers)
+        return found
+
+    def _note(self, fault: str | None) -> None:
+        if fault is None:
+            if not self._usable.is_set():
+                _log.info("the pool computes for this rig", pool=self._address)
+            self._usable.set()
+            return
+        if self._usable.is_set() or fault != self.fault:
+            _log.warning("the pool cannot be used, this machine computes", pool=self._address, cause=fault)
+        self.fault = fault
+        self._usable.clear()
+
+    def _lack(self, workers: Collection[Mapping[str, Any]]) -> str | None:
+        """What the pool lacks, None if orders can be given."""
+        if not workers:
+            return f"the pool {self._address} has no workers"
+        if not any(self._resource in worker["resources"] for worker in workers):
+            return f"no worker of {self._address} has this machine's versions of slrig and its libraries"
+        return None
+
+    async def _answer(self, order: PoolRequest) -> PoolResponse:
+        future: distributed.Future[PoolResponse] | None = None
+        try:
+            if self._client is None:
+                raise PoolError(self.fault)  # noqa: TRY301 - lost since it was asked
+            # By a key of its own: two orders of one bundle are two. dask gives it to another machine when one is lost;
+            # a scheduler that is lost knows nothing of it any more.
+            future = self._client.submit(compute, order, key=order.job, pure=False, resources={self._resource: 1})
+            answer: PoolResponse = await future
+            return answer  # noqa: TRY300
+        except asyncio.CancelledError:
+            raise
+        except BaseException as error:
+            message = f"the pool {self._address} lost the job ({type(error).__name__})"
+            self._note(message)
+            raise PoolError(message) from error
+        finally:
+            self._told.pop(order.job, None)
+            if future is not None:
+                with suppress(Exception):
+                    await future.cancel()
+
+    def _hear(self, event: tuple[float, Mapping[str, Any]]) -> None:
+        if (told := self._told.get(event[1]["job"])) is not None:
+            told(event[1])
+
 
 TRIES = 2
 """How often a job is given to the pool. One machine that is lost costs none: dask gives its job to another one."""

@@ -9,8 +9,7 @@ from slrig.conformance.running import run_checks
 from slrig.jobs.job import Job, JobRun, Outcome
 from slrig.jobs.records import JobKind
 from slrig.rig.session import RigSession
-from slrig.scan.plan import PatternPlan, ScanPlan
-from slrig.scan.plan_check import rig_sequence
+from slrig.scan.plan import PatternPlan, ScanPlan, rig_sequence
 
 
 @dataclass(frozen=True, slots=True)

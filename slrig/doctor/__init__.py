@@ -1,17 +1,30 @@
 """Examination of a rig: findings with remedies, and a rig file with the measured values."""
 
 from slrig.doctor.doctor import Diagnosis, doctor_sequence, examine, latency_from_document
-from slrig.doctor.job import DoctorJob, LatencyJob
+from slrig.doctor.job import (
+    EXAMINATIONS,
+    DoctorJob,
+    Examination,
+    Examinations,
+    LatencyJob,
+    keep,
+    last_examination,
+)
 from slrig.doctor.light import Severity
 from slrig.doctor.rig_file import refuse_existing, toml_value, write_rig_file
 
 __all__ = [
+    "EXAMINATIONS",
     "Diagnosis",
     "DoctorJob",
+    "Examination",
+    "Examinations",
     "LatencyJob",
     "Severity",
     "doctor_sequence",
     "examine",
+    "keep",
+    "last_examination",
     "latency_from_document",
     "refuse_existing",
     "toml_value",

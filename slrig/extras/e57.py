@@ -13,7 +13,7 @@ from slrig.errors import ExtraMissingError, NothingToReconstructError, StorageEr
 from slrig.plugins import FileFormat
 
 if TYPE_CHECKING:
-    from slrig.scan.organised import OrganisedCloud
+    from slrig.scan.clouds import OrganisedCloud
 
 FORMAT = FileFormat(
     "points-{camera}.e57", "model/e57", "pye57", "pip install 'slrig[e57]'", "slrig.extras.e57:encode_e57"

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 
 from slrig.config import ServiceSettings
 from slrig.errors import ConfigError
-from slrig.jobs.outbox import Notice, Outbox
-from slrig.schedule.receivers import secret_of
-from slrig.schedule.sending import TIMEOUT_S, Sender
+from slrig.jobs.store import Notice, Outbox
+from slrig.schedule.notices import TIMEOUT_S, Sender, secret_of
 
 if TYPE_CHECKING:
     from paho.mqtt.reasoncodes import ReasonCode

@@ -21,7 +21,7 @@ from slrig.ros_messages import PROJECTOR, TF_STATIC, Device, Messages, topic
 
 if TYPE_CHECKING:
     from slrig.model import Calibration, Pinhole, Pixels
-    from slrig.scan.organised import OrganisedCloud
+    from slrig.scan.clouds import OrganisedCloud
 
 FORMAT = FileFormat(
     "scan.mcap", "application/octet-stream", "rosbags", "pip install 'slrig[ros]'", "slrig.extras.ros:encode_bag"

@@ -1,8 +1,11 @@
-"""One kind of work: what a job is asked to do, what it is given while it does it, and what it found."""
+"""One kind of work: its plan, what it gets while it runs, how its progress and its frames get on, and its outcome."""
 
 from __future__ import annotations
 
 import math
+import os
+import queue
+import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -10,16 +13,208 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol, Self
 from uuid import UUID
 
+import structlog
 from pydantic import TypeAdapter
 
 from slrig.capture import EvidenceSummary
-from slrig.errors import ScanCancelledError
+from slrig.errors import ScanCancelledError, StorageError
 from slrig.failure import JobFailure
 from slrig.jobs.data_folder import BUNDLE, RESULT, DataFolder
-from slrig.jobs.frame_feed import FrameSink
-from slrig.jobs.records import JobKind, JobRecord
-from slrig.model import Region
+from slrig.jobs.records import JobKind, JobProgress, JobRecord
+from slrig.jobs.store import JobStore
+from slrig.model import Calibration, CaptureHeader, Region, Shot
 from slrig.rig.session import RigSession
+
+LEAST_WAITING_BYTES, MOST_WAITING_BYTES = 128 * 2**20, 512 * 2**20
+"""How much of frames may wait for the reconstruction: a whole scan of a common camera where there is little memory, and
+where there is more, 40 frames of 12 megapixels: a line frame of those takes the reconstruction longer than the camera.
+"""
+_SHARE_OF_MEMORY = 1 / 16
+
+
+def most_waiting_bytes() -> int:
+    """The bytes of frames that may wait on this machine."""
+    if "SC_PHYS_PAGES" not in getattr(os, "sysconf_names", {}):
+        return LEAST_WAITING_BYTES
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return min(max(int(memory * _SHARE_OF_MEMORY), LEAST_WAITING_BYTES), MOST_WAITING_BYTES)
+
+
+@dataclass(frozen=True, slots=True)
+class Begin:
+    """Frames of this header will come, and then what they have proven. region : what of the scene is asked for."""
+
+    header: CaptureHeader
+    calibration: Calibration
+    region: Region | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Abandon:
+    """Forget the frames that came."""
+
+
+class FrameSink(Protocol):
+    """Is shown the frames of a capture as they are taken."""
+
+    def begin(self, header: CaptureHeader, calibration: Calibration | None) -> None:
+        """Take note of what will come."""
+        ...
+
+    def take(self, shot: Shot) -> None:
+        """Take a frame that has passed its test. Returns at once. One that comes again takes the place of the first."""
+        ...
+
+    def end(self, evidence: EvidenceSummary) -> None:
+        """Take note that all frames have come."""
+        ...
+
+
+class FrameFeed:
+    """Sends the frames of one capture to the reconstruction process, on a thread of its own.
+
+    send : sends one message, and returns False when nobody receives it any more; it may block. number : of the task
+    that will use the frames. receiver : what they are sent to, by which the task's process is known. region : what of
+    the scene is asked for. `evidence` is what the frames have proven once all have come, whether they were sent or not.
+    """
+
+    def __init__(
+        self,
+        send: Callable[[object], bool],
+        *,
+        number: int = 0,
+        receiver: object = None,
+        region: Region | None = None,
+        most_bytes: int | None = None,
+    ) -> None:
+        self.number = number
+        self.receiver = receiver
+        self.evidence: EvidenceSummary | None = None
+        self._send = send
+        self._region = region
+        self._most_bytes = most_waiting_bytes() if most_bytes is None else most_bytes
+        self._waiting: queue.Queue[Begin | Shot | EvidenceSummary | Abandon] = queue.Queue()
+        self._taken: set[tuple[int, str, float | None]] = set()
+        self._given_up = threading.Event()
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def begin(self, header: CaptureHeader, calibration: Calibration | None) -> None:
+        """Start the thread. Without a calibration nothing can be reconstructed, and nothing is sent."""
+        if calibration is None:
+            self.abandon()
+            return
+        self._waiting.put(Begin(header, calibration, self._region))
+        self._thread = threading.Thread(target=self._carry, name="slrig-feed", daemon=True)
+        self._thread.start()
+
+    def take(self, shot: Shot) -> None:
+        """Queue a frame. With too many waiting, or when it takes another one's place, give up."""
+        which = (shot.pattern, shot.camera, shot.exposure_s)
+        again = which in self._taken
+        self._taken.add(which)
+        if self._given_up.is_set():
+            return
+        if again:
+            # What was concluded from the first one cannot be taken back.
+            _log.info("a frame was shot again; the reconstruction will read the bundle", pattern=shot.pattern)
+            self.abandon()
+        elif (self._waiting.qsize() + 1) * shot.image.nbytes > self._most_bytes:
+            _log.info("the reconstruction falls behind the capture; it will read the bundle")
+            self.abandon()
+        else:
+            self._waiting.put(shot)
+
+    def end(self, evidence: EvidenceSummary) -> None:
+        """Queue the end."""
+        self.evidence = evidence
+        self._waiting.put(evidence)
+
+    def abandon(self) -> None:
+        """Send no more, and have what was sent forgotten. After the end has been sent this does nothing."""
+        self._given_up.set()
+        self._waiting.put(Abandon())
+
+    def settled(self, timeout_s: float) -> bool:
+        """Wait at most so long; return whether nothing more will be sent."""
+        if self._thread is not None:
+            self._thread.join(timeout_s)
+        return self._thread is None or not self._thread.is_alive()
+
+    @property
+    def whole(self) -> bool:
+        """Whether every frame was sent, and the end."""
+        return self._ended.is_set()
+
+    def _carry(self) -> None:
+        while True:
+            message = self._waiting.get()
+            if self._given_up.is_set():
+                self._waiting = queue.Queue()  # lets the frames go
+                self._send(Abandon())
+                return
+            if not self._send(message):
+                self._given_up.set()
+                return
+            if isinstance(message, EvidenceSummary):
+                self._ended.set()
+                return
+
+
+class FedFrames:
+    """The other end: the frames of the capture under way, as far as they have come. begin : makes what takes them."""
+
+    def __init__(self, begin: Callable[..., Any]) -> None:
+        self._begin = begin
+        self._live: Any = None
+
+    def hear(self, message: object) -> None:
+        """Take a message of a feed. Frames that cannot be used are forgotten: reading the bundle will tell why."""
+        try:
+            match message:
+                case Begin(header, calibration, region):
+                    self._live = self._begin(header, calibration, region)
+                case Shot() if self._live is not None:
+                    self._live.take(message)
+                case EvidenceSummary() if self._live is not None:
+                    self._live.end(message)
+                case Abandon():
+                    self.forget()
+        except Exception as error:  # noqa: BLE001 - a head start that fails is no failure of the scan
+            _log.warning("frames could not be used while they were taken", cause=repr(error))
+            self.forget()
+
+    def taken(self) -> Any:
+        """What has taken the frames, None when nothing has."""
+        return self._live
+
+    def forget(self) -> None:
+        """Let the frames go."""
+        self._live = None
+
+
+class FedCaptures:
+    """The frames of the captures that no task has used yet, by the number of the task: of one that is computed next,
+    and one that is under way. receiver : makes what takes the frames of a capture.
+    """
+
+    def __init__(self, receiver: Callable[[], FedFrames]) -> None:
+        self._receiver = receiver
+        self._captures: dict[int, FedFrames] = {}
+
+    def hear(self, number: int, message: object) -> None:
+        """Take a message of a capture's feed."""
+        if number not in self._captures:
+            if self._captures and number < max(self._captures):
+                return
+            self._captures = {each: self._captures[each] for each in sorted(self._captures)[-1:]}
+            self._captures[number] = self._receiver()
+        self._captures[number].hear(message)
+
+    def taken(self, number: int) -> Any:
+        """What has taken the frames of a capture, None when nothing has; they are let go here."""
+        frames = self._captures.pop(number, None)
+        return None if frames is None else frames.taken()
 
 
 class Recording(Protocol):
@@ -210,3 +405,63 @@ def _adapter(kind: type[Job]) -> TypeAdapter[Any]:
 def due_s(job: Job) -> float:
     """When a job may begin, by `time.monotonic`."""
     return time.monotonic() + job.due_in_s
+
+
+_LEAST_STEP = 0.01
+_LEAST_S = 0.1  # each is brought to disk, on the thread that captures; nobody sees more than ten a second
+_DETAIL_S = 2.0  # a person who looks on wants a sign every few seconds
+
+_log = structlog.get_logger(__name__)
+
+
+class ProgressRecorder:
+    """Takes progress from the work and records the steps worth telling: a new stage, a hundredth of the way, ten times
+    a second at most, the end, or another detail of a stage that goes on.
+    """
+
+    def __init__(
+        self,
+        store: JobStore,
+        job_id: UUID,
+        *,
+        hidden: str,
+        span: tuple[float, float] = (0.0, 1.0),
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """`hidden` is left out of what is recorded; the fractions told are of `span`, a part of the whole job."""
+        self._now_s = now_s
+        self._told_s = -math.inf
+        self._hidden = hidden
+        self._store = store
+        self._job_id = job_id
+        self._start, self._end = span
+        self._told = JobProgress("", -1.0, "")
+
+    def file_made(self, name: str) -> None:
+        """Take note of a file that can be fetched before the job is over; a refusal fails no work, either."""
+        self._recorded("a file of a job could not be announced", lambda: self._store.file_made(self._job_id, name))
+
+    def captured(self) -> None:
+        """Take note that the job needs the rig no longer; a refusal fails no work, either."""
+        self._recorded("that the rig is free of a job could not be told", lambda: self._store.captured(self._job_id))
+
+    def __call__(self, stage: str, fraction: float, detail: str) -> None:
+        """Take note, as `slrig.scan.plan.ProgressCallback` asks. A record that is refused fails no work: see the
+        log.
+        """
+        overall = self._start + (self._end - self._start) * min(max(fraction, 0.0), 1.0)
+        since_s = self._now_s() - self._told_s
+        goes_on = detail != self._told.detail and since_s >= _DETAIL_S
+        further = overall - self._told.fraction >= _LEAST_STEP and (since_s >= _LEAST_S or fraction >= 1)
+        if goes_on or stage != self._told.stage or further:
+            self._told = JobProgress(stage, overall, detail.replace(self._hidden, ""))
+            self._told_s = self._now_s()
+            self._recorded(
+                "how far a job is could not be recorded", lambda: self._store.progress(self._job_id, self._told)
+            )
+
+    def _recorded(self, refused: str, record: Callable[[], None]) -> None:
+        try:
+            record()
+        except StorageError as error:
+            _log.warning(refused, job=str(self._job_id), cause=str(error))

@@ -33,13 +33,11 @@ from slrig.errors import (
     StorageError,
 )
 from slrig.failure import UNEXPECTED, interruption_error, job_failure
-from slrig.jobs.compute import Compute, job_task
 from slrig.jobs.data_folder import DataFolder, missing_files
-from slrig.jobs.frame_feed import FrameFeed
-from slrig.jobs.job import Group, Job, JobRun, Outcome, Recording, due_s
-from slrig.jobs.progress import ProgressRecorder
+from slrig.jobs.job import FrameFeed, Group, Job, JobRun, Outcome, ProgressRecorder, Recording, due_s
 from slrig.jobs.records import Holder, JobKind, JobRecord, JobState, acting_as, holder_of, utc_now, write_record
 from slrig.jobs.store import JobStore
+from slrig.jobs.worker import Compute, job_task
 from slrig.rig.preview import Light, Previews, Watch
 from slrig.rig.session import ActiveCalibration, RigFacts, RigSession, driver_errors
 from slrig.rig.watchdog import Call, Watchdog

@@ -1,21 +1,24 @@
-"""The record of jobs and their events, in the service's database."""
+"""Records of jobs, their events, idempotency keys, audit and notices in the service's database."""
 
 from __future__ import annotations
 
+import json
 import threading
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from datetime import datetime
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
 from typing import Any
 from uuid import UUID, uuid4
 
-from sqlalchemy import Select, delete, func, select, text
+import structlog
+from sqlalchemy import ColumnElement, Select, delete, event, func, select, text
 from sqlalchemy.orm import Session
 
-from slrig.errors import JobNotFoundError
+from slrig.config import NoticeKind
+from slrig.errors import IdempotencyError, JobNotFoundError, KeyInFlightError
 from slrig.failure import JobFailure
-from slrig.jobs.database import Database
-from slrig.jobs.outbox import Outbox
+from slrig.jobs.database import AuditRow, CopyRow, Database, EventRow, JobRow, KeyRow, NoticeRow, record_of
 from slrig.jobs.records import (
     Clock,
     JobEvent,
@@ -28,7 +31,203 @@ from slrig.jobs.records import (
     stamp,
     utc_now,
 )
-from slrig.jobs.tables import EventRow, JobRow, KeyRow, record_of
+
+
+@dataclass(frozen=True, slots=True)
+class CatalogueCopy:
+    """What a catalogue is told of a job that ended. number : the order in which jobs ended. job : JSON values."""
+
+    number: int
+    job: Mapping[str, Any]
+
+
+class Copies:
+    """What waits to be copied, from old to new. Any thread may call. `news` is set when one more waits."""
+
+    def __init__(self, database: Database, *, clock: Clock = utc_now) -> None:
+        self._database = database
+        self._clock = clock
+        self.news = threading.Event()
+
+    def put(self, session: Session, job: JobRecord) -> None:
+        """Have a job copied once the session's changes are kept."""
+        session.add(CopyRow(at=stamp(self._clock()), job_id=str(job.id), body=told(job)))
+        event.listen(session, "after_commit", lambda _: self.news.set(), once=True)
+
+    def oldest(self, limit: int) -> Sequence[CatalogueCopy]:
+        """Those to copy next."""
+        with self._database.reading() as session:
+            rows = session.scalars(select(CopyRow).order_by(CopyRow.number).limit(limit))
+            return [CatalogueCopy(row.number, row.body) for row in rows]
+
+    def taken(self, copies: Sequence[CatalogueCopy]) -> None:
+        """Forget what the catalogue has."""
+        with self._database.changing() as session:
+            session.execute(delete(CopyRow).where(CopyRow.number.in_([each.number for each in copies])))
+
+    def waiting(self) -> tuple[int, float]:
+        """How many wait, and for how many seconds the oldest does."""
+        with self._database.reading() as session:
+            count = session.scalar(select(func.count()).select_from(CopyRow)) or 0
+            oldest = session.scalar(select(CopyRow.at).order_by(CopyRow.number).limit(1))
+        age_s = 0.0 if oldest is None else (self._clock() - datetime.fromisoformat(oldest)).total_seconds()
+        return count, max(age_s, 0.0)
+
+    def ended(self) -> list[str]:
+        """The ids of the jobs on record that ended and do not wait here, in the order in which they ended."""
+        final, waiting = [state for state in JobState if state.final], select(CopyRow.job_id)
+        ended = select(JobRow.id).where(JobRow.state.in_(final), JobRow.id.not_in(waiting))
+        query = ended.order_by(JobRow.finished_at, JobRow.number)
+        with self._database.reading() as session:
+            return list(session.scalars(query))
+
+    def of(self, ids: Collection[str]) -> Sequence[Mapping[str, Any]]:
+        """What a catalogue is told of these, as far as they are on record, in the order in which they ended."""
+        query = select(JobRow).where(JobRow.id.in_(ids)).order_by(JobRow.finished_at, JobRow.number)
+        with self._database.reading() as session:
+            return [told(record_of(row)) for row in session.scalars(query)]
+
+
+def told(job: JobRecord) -> dict[str, Any]:
+    """What a catalogue is told of a job, by the names of its columns.
+
+    points, triangles : of a scan's mesh. sigma_mm : the median of its points' standard deviations.
+    """
+    summary = job.summary or {}
+    mesh, computed = summary.get("mesh") or {}, summary.get("computed") or {}
+    moments = {"created_at": job.created_at, "started_at": job.started_at, "finished_at": job.finished_at}
+    return {
+        "job": str(job.id),
+        "rig": job.rig,
+        "kind": str(job.kind),
+        "label": job.label,
+        "parent": None if job.parent is None else str(job.parent),
+        "state": str(job.state),
+        "requested_by": job.requested_by,
+        **{name: None if moment is None else stamp(moment) for name, moment in moments.items()},
+        "fault_code": None if job.fault is None else job.fault.code,
+        "fault_message": None if job.fault is None else job.fault.message,
+        "points": mesh.get("points"),
+        "triangles": (mesh.get("figures") or {}).get("triangles"),
+        "sigma_mm": (mesh.get("sigma_mm") or {}).get("p50"),
+        "computed_where": computed.get("where"),
+        "computed_host": computed.get("host"),
+    }
+
+
+MOST_WAITING = 10_000
+KEPT_FOR = timedelta(hours=72)
+
+_log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """One notice. number : their order; id : the same at each try, to each receiver; body : JSON values."""
+
+    number: int
+    id: str
+    body: Mapping[str, Any]
+
+    @property
+    def content(self) -> bytes:
+        """The body as it is sent: JSON in UTF-8."""
+        return json.dumps(self.body, separators=(",", ":"), ensure_ascii=False).encode()
+
+
+class Outbox:
+    """What waits for each receiver, from old to new. Any thread may call.
+
+    rig : the name that notices bear. wanted : the kinds that each receiver wants, by its name; all others are let go.
+    most : may wait for one; the oldest make room. `news` is set when one more waits, `dropped` counts those that were
+    never sent. copies : takes every job that ends, for a catalogue; None where there is none.
+    """
+
+    def __init__(
+        self,
+        database: Database,
+        *,
+        rig: str = "",
+        wanted: Mapping[str, Collection[NoticeKind]] | None = None,
+        clock: Clock = utc_now,
+        most: int = MOST_WAITING,
+        copies: Copies | None = None,
+    ) -> None:
+        self.database = database
+        self._rig = rig
+        self._wanted = wanted or {}
+        self._clock = clock
+        self._most = most
+        self.news = {receiver: threading.Event() for receiver in self._wanted}
+        self.dropped = 0
+        self.copies = copies
+
+    def put(self, session: Session, kind: NoticeKind, words: str, /, **members: Mapping[str, Any]) -> None:
+        """Have a notice sent once the session's changes are kept. words : what it says to people, but for the rig."""
+        notice_id, at = f"msg_{uuid4().hex}", stamp(self._clock())
+        body = {"id": notice_id, "kind": kind, "at": at, "rig": self._rig, "words": f"rig '{self._rig}': {words}"}
+        # Those of receivers that are no longer in the settings wait for as long, in case these come back.
+        old = NoticeRow.at < stamp(self._clock() - KEPT_FOR)
+        session.execute(delete(NoticeRow).where(NoticeRow.receiver.not_in(self._wanted), old))
+        for receiver in (name for name, kinds in self._wanted.items() if kind in kinds):
+            session.add(NoticeRow(receiver=receiver, id=notice_id, at=at, kind=kind, body={**body, **members}))
+            numbers = select(NoticeRow.number).where(NoticeRow.receiver == receiver).order_by(NoticeRow.number.desc())
+            surplus = NoticeRow.number <= numbers.offset(self._most).limit(1).scalar_subquery()
+            self._drop(session, receiver, surplus, f"more than {self._most} wait")
+            event.listen(session, "after_commit", lambda _, news=self.news[receiver]: news.set(), once=True)
+
+    def ended(self, session: Session, job: JobRecord) -> None:
+        """Tell of a job that comes to its end."""
+        fault = None if job.fault is None else {"code": job.fault.code, "message": job.fault.message}
+        more = "" if job.fault is None else f": {job.fault.message}"
+        moments = {
+            name: None if moment is None else stamp(moment)
+            for name, moment in (("started_at", job.started_at), ("finished_at", job.finished_at))
+        }
+        told = {**reference(job), "state": str(job.state), "error": fault, "requested_by": job.requested_by, **moments}
+        state = job.state if job.state in {JobState.SUCCEEDED, JobState.FAILED} else f"was {job.state}"
+        self.put(session, "job.ended", f"{job.kind} {job.id} {state}{more}", job=told)
+
+    def closed(self, session: Session, job: JobRecord) -> None:
+        """Have a catalogue know of a job in its final state, and of each change of that."""
+        if self.copies is not None:
+            self.copies.put(session, job)
+
+    def oldest(self, receiver: str) -> Notice | None:
+        """The notice to send next. Drops those that have waited for too long."""
+        while True:
+            with self.database.reading() as session:
+                waiting = select(NoticeRow).where(NoticeRow.receiver == receiver)
+                row = session.scalar(waiting.order_by(NoticeRow.number).limit(1))
+            if row is None:
+                return None
+            limit = stamp(self._clock() - KEPT_FOR)
+            if row.at >= limit:
+                return Notice(row.number, row.id, row.body)
+            with self.database.changing() as session:
+                hours = KEPT_FOR // timedelta(hours=1)
+                self._drop(session, receiver, NoticeRow.at < limit, f"they have waited for {hours} hours")
+
+    def sent(self, notice: Notice) -> None:
+        """Forget a notice that its receiver has."""
+        with self.database.changing() as session:
+            session.execute(delete(NoticeRow).where(NoticeRow.number == notice.number))
+
+    def waiting(self, receiver: str) -> tuple[int, float]:
+        """How many wait, and for how many seconds the oldest does."""
+        query = select(func.count(), func.min(NoticeRow.at)).where(NoticeRow.receiver == receiver)
+        with self.database.reading() as session:
+            count, oldest = session.execute(query).one()
+        if count == 0:
+            return 0, 0.0
+        return count, max((self._clock() - datetime.fromisoformat(oldest)).total_seconds(), 0.0)
+
+    def _drop(self, session: Session, receiver: str, which: ColumnElement[bool], cause: str) -> None:
+        query = delete(NoticeRow).where(NoticeRow.receiver == receiver, which).returning(NoticeRow.id)
+        if gone := list(session.scalars(query)):
+            self.dropped += len(gone)
+            _log.error("notices were dropped", receiver=receiver, count=len(gone), first=gone[0], cause=cause)
+
 
 _LISTED: dict[str, str] = {
     JobKind.SCAN: "GET /scan lists those that are.",
@@ -390,3 +589,126 @@ def _new_row(
 def _append(session: Session, row: JobRow, kind: str, data: dict[str, Any]) -> None:
     row.last_event += 1
     session.add(EventRow(job_id=row.id, number=row.last_event, kind=kind, data=data))
+
+
+KEY_LIFE_S = 24 * 3600.0
+"""How long a key is remembered unless told otherwise."""
+
+
+class RequestKeys:
+    """The keys on record. Any thread may call."""
+
+    def __init__(self, database: Database, *, clock: Clock = utc_now, life_s: float = KEY_LIFE_S) -> None:
+        self._database = database
+        self._clock = clock
+        self._life = timedelta(seconds=life_s)
+
+    def reserve(self, key: str, fingerprint: str) -> UUID | None:
+        """Hold a key for a request, or return what the first request with it made.
+
+        Raises
+        ------
+        KeyInFlightError
+            The first request is still being answered.
+        IdempotencyError
+            The first request had another body.
+        """
+        with self._database.changing() as session:
+            expired = stamp(self._clock() - self._life)
+            session.execute(delete(KeyRow).where(KeyRow.created_at < expired))
+            held = session.get(KeyRow, key)
+            if held is None:
+                session.add(KeyRow(key=key, fingerprint=fingerprint, job_id=None, created_at=stamp(self._clock())))
+                return None
+            if held.fingerprint != fingerprint:
+                message = (
+                    "This Idempotency-Key was sent before with another request body. Use a new key for a new request, "
+                    "or repeat the first one unchanged."
+                )
+                raise IdempotencyError(message)
+            if held.job_id is None:
+                message = "The first request with this Idempotency-Key is still being answered. Ask again in a second."
+                raise KeyInFlightError(message)
+            return UUID(held.job_id)
+
+    def tie(self, key: str, made: UUID) -> None:
+        """Put on record what a request with a key made. A job is tied to its key by `JobStore.create`."""
+        with self._database.changing() as session:
+            if (held := session.get(KeyRow, key)) is not None:
+                held.job_id = str(made)
+
+    def release(self, key: str) -> None:
+        """Free a key whose request made nothing, so that it may be tried again."""
+        with self._database.changing() as session:
+            session.execute(delete(KeyRow).where(KeyRow.key == key, KeyRow.job_id.is_(None)))
+
+    def release_all(self) -> None:
+        """Free every key whose request was cut off. For the start of the service, when none can be in flight."""
+        with self._database.changing() as session:
+            session.execute(delete(KeyRow).where(KeyRow.job_id.is_(None)))
+
+
+MOST_ENTRIES = 100_000
+"""The oldest go when there are more: some 20 MB, a year of 270 requests a day."""
+
+_PRUNE_EVERY = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class AuditEntry:
+    """One request. who : the name of the key. made : the path of what it made, "" where it made nothing."""
+
+    number: int
+    at: datetime
+    who: str
+    address: str
+    method: str
+    path: str
+    status: int
+    made: str
+
+
+class Audit:
+    """The record. Any thread may call."""
+
+    def __init__(self, database: Database, *, clock: Clock = utc_now) -> None:
+        self._database = database
+        self._clock = clock
+
+    def note(self, who: str, address: str, method: str, path: str, status: int, made: str) -> None:
+        """Put a request on record. Raises StorageError."""
+        row = AuditRow(
+            at=stamp(self._clock()),
+            who=who,
+            address=address,
+            method=method[:16],
+            path=path[:400],
+            status=status,
+            made=made[:400],
+        )
+        with self._database.changing() as session:
+            session.add(row)
+            session.flush()
+            if row.number % _PRUNE_EVERY == 0:
+                newest = session.scalar(select(func.max(AuditRow.number))) or 0
+                session.execute(delete(AuditRow).where(AuditRow.number <= newest - MOST_ENTRIES))
+
+    def page(self, *, before: int | None, limit: int) -> Sequence[AuditEntry]:
+        """Up to `limit` entries, newest first, whose number is below `before`."""
+        query = select(AuditRow).order_by(AuditRow.number.desc()).limit(limit)
+        if before is not None:
+            query = query.where(AuditRow.number < before)
+        with self._database.reading() as session:
+            return [
+                AuditEntry(
+                    row.number,
+                    datetime.fromisoformat(row.at),
+                    row.who,
+                    row.address,
+                    row.method,
+                    row.path,
+                    row.status,
+                    row.made,
+                )
+                for row in session.scalars(query)
+            ]

@@ -6,30 +6,386 @@ joins it at exit. Here a lost process is seen at once, and the next job starts a
 
 from __future__ import annotations
 
+import importlib
 import itertools
 import multiprocessing
 import os
+import signal
 import threading
 import time
+import traceback
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from ctypes import c_double
-from multiprocessing.connection import Connection
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from multiprocessing.sharedctypes import RawValue
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
+from uuid import UUID
 
 import structlog
 
 from slrig import logs
+from slrig.capture import EvidenceSummary
 from slrig.errors import ScanCancelledError, WorkerBusyError, WorkerLostError
-from slrig.failure import errors_by_code, interruption_error
-from slrig.jobs.frame_feed import FrameFeed
-from slrig.jobs.worker_process import Failed, Fed, Preparing, Ready, RunTask, Task, Unloadable, received, sent, serve
-from slrig.jobs.worker_wait import POLL_S, PREPARING, JobWait, Made, Told
+from slrig.failure import JobFailure, errors_by_code, interruption_error, job_failure
+from slrig.jobs.job import FedCaptures, FrameFeed, Job, JobRun
+from slrig.logs import LogSettings, set_up_logs
 from slrig.model import Region
+
+HEARTBEAT_S = 0.5
+"""How often the process says that it runs: often enough that a person who asks `/readyz` sees a stop within seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class JobFiles:
+    """Where the files of a job are made, and where they belong; what its frames proved as they were captured."""
+
+    id: UUID
+    folder: Path
+    place: Path | None = None
+    evidence: EvidenceSummary | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A task of the worker: a call of a function, which is found there by its name and loads its mathematics itself.
+
+    files : of a job, whose `Job.compute` the function is: it is given a `JobRun`. what : the task in words. remedy :
+    what a person can do when the worker is lost in the middle of it. movable : the bundle among its files is all that
+    is needed: another machine may do it. where : how it came to be done where it is, for a report.
+    """
+
+    function: Callable[..., Any]
+    given: tuple[Any, ...] = ()
+    files: JobFiles | None = None
+    what: str = "task"
+    remedy: str = "Try again."
+    movable: bool = False
+    where: Mapping[str, str] = field(default_factory=lambda: {"where": "local"})
+
+
+@dataclass(frozen=True, slots=True)
+class RunTask:
+    """Parent to child: do this, with the frames that were sent under the same number if `fed`.
+
+    named : what the lines of the log carry meanwhile, as the job's id.
+    """
+
+    number: int
+    task: Task
+    fed: bool
+    named: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Fed:
+    """Parent to child, before the job of this number: a message for what receives frames."""
+
+    number: int
+    message: object
+
+
+@dataclass(frozen=True, slots=True)
+class Preparing:
+    """Child to parent: a kernel is being compiled, after `done` of `total`."""
+
+    done: int
+    total: int
+
+    def __str__(self) -> str:
+        return f"first time only: {self.done} of {self.total}"
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """Child to parent: the kernels are loaded."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unloadable:
+    """Child to parent: the kernels cannot be loaded, and the process ends."""
+
+    cause: str
+
+
+@dataclass(frozen=True, slots=True)
+class Progressed:
+    """Child to parent: where the job is."""
+
+    number: int
+    stage: str
+    fraction: float
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class FileMade:
+    """Child to parent: a file of the result is there, whole; the job goes on."""
+
+    number: int
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """Child to parent: the job ended well."""
+
+    number: int
+    result: Any
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """Child to parent: the job failed. trace : the traceback, for the log."""
+
+    number: int
+    fault: JobFailure
+    trace: str
+
+
+def sent(pipe: Connection, message: object) -> bool:
+    """Send a message; return whether somebody is there to receive it."""
+    try:
+        pipe.send(message)
+    except OSError:
+        return False
+    return True
+
+
+def received(pipe: Connection) -> object | None:
+    """Wait for the next message; None once the other end is gone."""
+    try:
+        message: object = pipe.recv()
+    except (EOFError, OSError):
+        return None
+    return message
+
+
+def serve(
+    pipe: Connection, stops: Connection, heartbeat: c_double, module: str, logs: LogSettings | None = None
+) -> None:
+    """The child's life: prepare, then do jobs until the parent's end of the pipe is gone.
+
+    stops : brings the numbers of jobs that are not wanted any more, past whatever waits in the pipe. heartbeat : takes
+    the time of the last sign of life, `time.monotonic`. module : offers `warm_kernels(told)`, and `frame_receiver()`
+    for the frames of a capture; jobs find it as `JobRun.pipeline`. logs : how the parent logs.
+    """
+    if logs is not None:
+        set_up_logs(logs.level, logs.form)
+    # Ctrl-C reaches the whole foreground group; the parent decides what it means.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "SIGHUP"):  # not on Windows
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    _be_ended_first()
+    threading.Thread(target=_beat, args=(heartbeat,), name="slrig-heartbeat", daemon=True).start()
+    try:
+        loaded = importlib.import_module(module)
+        fed = FedCaptures(loaded.frame_receiver)
+        loaded.warm_kernels(lambda prepared: sent(pipe, Preparing(prepared.done, prepared.total)))
+    except Exception as error:  # noqa: BLE001 - whatever it is, the parent and the log are told
+        sent(pipe, Unloadable(f"{type(error).__name__}: {error}"))
+        _log.exception("the worker cannot load what it computes with", module=module)
+        raise SystemExit(1) from None
+    sent(pipe, Ready())
+    while (message := received(pipe)) is not None:
+        if isinstance(message, RunTask):
+            live = fed.taken(message.number) if message.fed else None
+            try:
+                with structlog.contextvars.bound_contextvars(**message.named):
+                    answer = _answer(pipe, stops, message, loaded, live)
+            except (ConnectionError, EOFError):
+                return
+            del live
+            sent(pipe, answer)
+            del answer
+        elif isinstance(message, Fed):
+            fed.hear(message.number, message.message)
+
+
+def _beat(heartbeat: c_double) -> None:
+    waiting = threading.Event()
+    while not waiting.wait(HEARTBEAT_S):
+        heartbeat.value = time.monotonic()
+
+
+def _be_ended_first() -> None:
+    """Have the kernel end this process rather than the service, which holds the rig, where memory runs out."""
+    with suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text("500")
+
+
+def _answer(pipe: Connection, stops: Connection, run: RunTask, pipeline: Any, live: Any) -> Done | Failed:
+    stopped = False
+    # A task may tell of its progress from several threads.
+    telling = threading.Lock()
+
+    def progress(stage: str, fraction: float, detail: str) -> None:
+        with telling:
+            pipe.send(Progressed(run.number, stage, fraction, detail))
+
+    def made(name: str) -> None:
+        with telling:
+            pipe.send(FileMade(run.number, name))
+
+    def cancelled() -> bool:
+        nonlocal stopped
+        while stops.poll():
+            stopped = stops.recv() == run.number or stopped
+        return stopped
+
+    task, files = run.task, run.task.files
+    try:
+        if files is None:
+            return Done(run.number, task.function(*task.given))
+        job_run = JobRun(
+            files.id, files.folder, files.place, progress, cancelled, made,
+            live=live, evidence=files.evidence, where=task.where, pipeline=pipeline,
+        )  # fmt: skip
+        return Done(run.number, task.function(job_run))
+    except (ConnectionError, EOFError):
+        # The parent is gone: nobody waits for an answer.
+        raise
+    except Exception as error:  # noqa: BLE001 - the traceback travels to the parent, which logs it
+        return Failed(run.number, job_failure(error), traceback.format_exc())
+
+
+CANCEL_LIMIT_S = 10.0
+"""A job that has not stopped this long after it was asked to is stopped by ending its process."""
+
+SILENCE_LIMIT_S = 30.0
+"""A process that shows no sign of life this long during a job is taken for dead. It shows two a second, and no single
+step of the mathematics holds the interpreter for more than a second or two; a machine that swaps may."""
+
+STANDSTILL_LIMIT_S = 900.0
+"""A job that tells no progress this long is taken for one that never ends: the longest step that was measured, a solve
+of sixty poses, takes about a minute."""
+
+PREPARING = "preparing kernels"
+"""The stage of compiling what numba has not compiled on this machine before."""
+
+POLL_S = 0.1
+
+Told = Callable[[str, float, str], None]
+"""Is told the stage of a job, the fraction of it that is done, and a detail for people."""
+
+Made = Callable[[str], None]
+"""Is told the name of a file that is there, whole, while the job goes on."""
+
+
+@dataclass(slots=True)
+class JobWait:
+    """The wait for one job: what the process says is heard, and what ends the wait is found. noted : takes what the
+    process says of itself.
+    """
+
+    task: Task
+    number: int
+    process: BaseProcess
+    pipe: Connection
+    stops: Connection
+    heartbeat: c_double
+    progress: Told
+    cancelled: Callable[[], bool]
+    made: Made
+    noted: Callable[[object | None], None]
+    answered: bool = False
+    _answer: Done | Failed | None = None
+    _stop_after: float | None = None
+    _looked_s: float = field(default_factory=time.monotonic)
+    _beat: float = -1.0
+    _silence_s: float = 0.0
+    _standstill_s: float = 0.0
+
+    def settled(self, feed: FrameFeed) -> bool:
+        """Wait until the frames of a capture have been sent, or cannot be; return whether all were."""
+        while not feed.settled(POLL_S):
+            # A process that still prepares its kernels takes no frames, and tells how far it is.
+            self._hear()
+            if self._watch():
+                feed.abandon()
+        return feed.whole
+
+    def answer(self) -> Done | Failed:
+        """Wait for the answer."""
+        while True:
+            ended = self.process.sentinel in wait([self.pipe, self.process.sentinel], timeout=POLL_S)
+            self._hear()
+            if self._answer is not None:
+                return self._answer
+            if ended and not self.pipe.poll():
+                self.noted(None)
+                raise self.lost()
+            self._watch()
+
+    def _hear(self) -> None:
+        while self._answer is None and self.pipe.poll():
+            match received(self.pipe):
+                case Progressed(number, stage, fraction, detail) if number == self.number:
+                    self._standstill_s = 0.0
+                    self.progress(stage, fraction, detail)
+                case FileMade(number, name) if number == self.number:
+                    self.made(name)
+                case Done(number) | Failed(number) as answer if number == self.number:
+                    self.answered, self._answer = True, answer
+                case Progressed() | FileMade() | Done() | Failed():
+                    _log.warning("an answer that nobody waits for was dropped")
+                case None | Unloadable() as told:
+                    self.noted(told)
+                    raise self.lost()
+                case told:
+                    self._standstill_s = 0.0
+                    self.noted(told)
+                    if isinstance(told, Preparing):
+                        self.progress(PREPARING, 0.0, str(told))
+
+    def _watch(self) -> bool:
+        """Have the process stop when the job is cancelled, and end it when it does not, or is dead or stuck. Returns
+        whether the job is cancelled.
+        """
+        now_s = time.monotonic()
+        # By looks rather than by the clock: where the service itself was stopped, nothing is known of the worker.
+        step_s, self._looked_s = min(now_s - self._looked_s, 1.0), now_s
+        if self.heartbeat.value != self._beat:
+            self._beat, self._silence_s = self.heartbeat.value, 0.0
+        else:
+            self._silence_s += step_s
+        self._standstill_s += step_s
+        if self._silence_s > SILENCE_LIMIT_S:
+            raise self._replaced(f"showed no sign of life for {self._silence_s:.0f} s")
+        if self._standstill_s > STANDSTILL_LIMIT_S:
+            raise self._replaced(f"told no progress for {self._standstill_s / 60:.0f} minutes")
+        if self._stop_after is not None and now_s > self._stop_after:
+            _log.warning("a job did not stop when asked, its process is ended", job=self.task.what)
+            message = f"The {self.task.what} was cancelled."
+            raise ScanCancelledError(message)
+        if self._stop_after is None and self.cancelled():
+            self._stop_after = now_s + CANCEL_LIMIT_S
+            sent(self.stops, self.number)
+        return self._stop_after is not None
+
+    def _replaced(self, why: str) -> WorkerLostError:
+        _log.error("the worker is replaced", job=self.task.what, why=why)
+        message = (
+            f"The worker {why} in the middle of the {self.task.what}, and has been replaced. Look for what stops or "
+            f"overloads this machine. {self.task.remedy}"
+        )
+        return WorkerLostError(message)
+
+    def lost(self) -> WorkerLostError:
+        """The error that stands for a process that ended."""
+        self.process.join()
+        code = self.process.exitcode
+        how = f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit code {code}"
+        message = (
+            f"The worker's process ended in the middle of the {self.task.what} ({how}), and has been replaced. If the "
+            f"machine ran out of memory, free some or use a camera of fewer pixels. {self.task.remedy}"
+        )
+        return WorkerLostError(message)
+
 
 SILENCE_TOLD_S = 5.0
 """From when on `condition` tells that the process shows no sign of life."""
@@ -63,7 +419,7 @@ class Worker:
     """Runs one task at a time in a child process, in the order in which they come. Any thread may call."""
 
     def __init__(self, module: str) -> None:
-        """`module` : see `slrig.jobs.worker_process.serve`."""
+        """`module` : see `slrig.jobs.worker.serve`."""
         self.module = module
         self._spawning = multiprocessing.get_context("spawn")
         self._process: BaseProcess | None = None
@@ -314,3 +670,48 @@ def prepare_kernel_cache(folder: Path) -> None:
 def _error(failed: Failed) -> Exception:
     known = errors_by_code().get(failed.fault.code)
     return UnexpectedWorkerError(failed.trace) if known is None else known(failed.fault.message)
+
+
+def job_task(job: Job, run: JobRun) -> Task:
+    """The second part of a job as a task."""
+    files = JobFiles(run.id, run.folder, run.place, run.evidence)
+    return Task(job.compute, (), files, what=job.noun, remedy=job.remedy, movable=job.movable)
+
+
+class Compute(Protocol):
+    """Does tasks for the service. Any thread may call. `slrig.jobs.worker.Worker` says what each part does."""
+
+    @property
+    def condition(self) -> str:
+        """`slrig.jobs.worker.READY`, how far the kernels are, or why nothing can be computed."""
+        ...
+
+    @property
+    def loading(self) -> bool:
+        """Whether it is not ready yet, and there is hope."""
+        ...
+
+    def start(self) -> None:
+        """Begin to be ready. Returns at once."""
+        ...
+
+    def feed(self, region: Region | None = None) -> FrameFeed:
+        """A way for the frames of a capture while they are taken; to be given to `run` afterwards."""
+        ...
+
+    def run(
+        self,
+        task: Task,
+        *,
+        progress: Told = ...,
+        cancelled: Callable[[], bool] = ...,
+        made: Made = ...,
+        feed: FrameFeed | None = None,
+        within_s: float | None = None,
+    ) -> Any:
+        """Do a task, and return its result."""
+        ...
+
+    def close(self) -> None:
+        """End what is computed. Idempotent."""
+        ...

@@ -1,4 +1,4 @@
-// Reads the meshes that slrig writes for this page (slrig/scan/view_format.py): arrays over the bytes as they came.
+// Reads the meshes that slrig writes for this page (slrig/scan/formats.py): arrays over the bytes as they came.
 import {Problem} from "./service.js";
 
 const MAGIC = 0x46546c67;

@@ -1,8 +1,7 @@
-"""Devices as the service calls them: what they raise says which device and which call, and no call hangs unnoticed.
+"""Devices as the service calls them: errors name device and call, no call hangs unnoticed, settings are remembered.
 
-Drivers raise what the operating system gives them, in its words; a scan is on record with words that a person can act
-on. And a call that does not return, because a driver or the kernel hangs, must not leave a scan under way, with the
-projector's light on, until somebody comes.
+Drivers raise what the operating system gives them; a record needs words that a person can act on. A call that does not
+return, because a driver or the kernel hangs, must not leave a job under way with the projector's light on.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from typing import Generic, TypeVar
 
 import structlog
 
+from slrig.capture import differs_from_request
 from slrig.devices import (
     DEFAULT_LIMITS,
     AppliedSettings,
@@ -44,7 +44,36 @@ from slrig.errors import (
     UnsupportedByDeviceError,
 )
 from slrig.model import Frame, PatternSequence, RotationAxis
-from slrig.rig.settings import SettingsInUse
+
+
+@dataclass(frozen=True, slots=True)
+class SettingsInUse:
+    """applied : what the camera read back; None before it took any. refused : why it did not take what was asked for
+    last, and so goes on with the settings before.
+    """
+
+    asked: CameraSettings
+    applied: AppliedSettings | None
+    refused: str | None = None
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """What a person should know of them, a sentence each; none where the camera uses what was asked for.
+
+        >>> SettingsInUse(CameraSettings(0.02), AppliedSettings(0.015, 1.0)).words
+        ('It was asked for an exposure of 20 ms, and uses 15 ms: write a value that it can use into the rig file.',)
+        """
+        if self.refused is not None:
+            return (f"It refused what it was asked for last: {self.refused}",)
+        if self.applied is None:
+            return ()
+        asked, uses, told = self.asked, self.applied, []
+        if differs_from_request(uses.exposure_s, asked.exposure_s):
+            told.append(f"an exposure of {1e3 * asked.exposure_s:.4g} ms, and uses {1e3 * uses.exposure_s:.4g} ms")
+        if differs_from_request(uses.gain, asked.gain):
+            told.append(f"a gain of {asked.gain:.4g}, and uses {uses.gain:.4g}")
+        return tuple(f"It was asked for {each}: write a value that it can use into the rig file." for each in told)
+
 
 OPEN = "open"
 """The step of opening a whole rig."""

@@ -6,18 +6,122 @@ Pictures are (H, W, 3) uint8, blue, green, red, as OpenCV has them.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import StorageError
-from slrig.meshing import weighted_percentiles
-from slrig.model import FloatArray, Mesh, Pinhole, Pixels, Refusal, Size
-from slrig.scan.placing import resampled
-from slrig.scan.shading import Picture, resized, shaded
+from slrig.kernels import in_bands, kernel
+from slrig.meshing import rasterise, rasterise_normals, weighted_percentiles
+from slrig.model import (
+    AlbedoMark,
+    Axis,
+    FloatArray,
+    LightMap,
+    Mesh,
+    Pinhole,
+    Pixels,
+    Refusal,
+    Size,
+    Source,
+    linear_to_srgb,
+)
+from slrig.reconstruction import (
+    BRIGHT_ALBEDO,
+    BRIGHT_PERCENT,
+    Albedo,
+    AlbedoSamples,
+    Illumination,
+    MergedCurves,
+    SheetCurves,
+    estimate_albedo,
+    optical_depths_mm,
+    project,
+)
+from slrig.scan.stream import CameraResult
+
+_AT_ONCE = 65_536  # vertices: what is float64 in between stays below 4 MB
+
+
+def resampled(device: Pinhole, per_px: float, size: Size) -> Pinhole:
+    """The device with `per_px` pixels in the place of one along each side, `size` in all; place and lens stay."""
+    # Pixel centres are at integers in both, so that it is the corner of the picture, at -0.5, that stays.
+    offset = (per_px - 1) / 2
+    finer = np.array(((per_px, 0.0, offset), (0.0, per_px, offset), (0.0, 0.0, 1.0)))
+    return replace(device, size=size, matrix=finer @ device.matrix)
+
+
+def placed_vertices(vertices_mm: NDArray[np.floating[Any]], device: Pinhole) -> NDArray[np.float32]:
+    """(V, 3) float32: column and row, pixels, and depth along the optical axis, mm, of world points, (V, 3).
+
+    Points behind the device have NaN pixels and a depth that is not positive.
+    """
+    placed = np.zeros((len(vertices_mm), 3), dtype=np.float32)
+    for start in range(0, len(vertices_mm), _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        points = vertices_mm[part].astype(np.float64)
+        placed[part, :2] = project(device, points)
+        placed[part, 2] = optical_depths_mm(device, points)
+    return placed
+
+
+Picture = NDArray[np.uint8]
+
+_SUPERSAMPLING = 2
+_ROWS_AT_LEAST = 64  # in a band, a fifth of a millisecond
+_BACKDROP = (74, 67, 63)
+_COLOURS = np.array(((196, 209, 219), (92, 92, 176)), dtype=np.float64)  # of the front and of the back
+_DARK, _HEADLIGHT, _SIDE_LIGHT = 0.12, 0.46, 0.44  # of the colour: everywhere, and from each light at most
+_TO_VIEWER = np.array((0.0, 0.0, -1.0), dtype=np.float64)
+_TO_SIDE_LIGHT = np.array((0.55, -0.65, -0.52), dtype=np.float64)  # above and on one side, in the camera's frame
+
+
+def shaded(mesh: Mesh, camera: Pinhole) -> Picture:
+    """The picture of `camera`, the second light on the side to which the surface leans."""
+    wide, high = (extent * _SUPERSAMPLING for extent in (camera.size.width_px, camera.size.height_px))
+    finer = resampled(camera, _SUPERSAMPLING, Size(wide, high))
+    placed = placed_vertices(mesh.vertices_mm, finer)
+    view = rasterise(placed, mesh.faces, finer.size)
+    normals, front = rasterise_normals(view, placed, mesh.normals, mesh.faces)
+    leaning = float(normals.sum(axis=0).sum(axis=0, dtype=np.float64) @ camera.rotation[0])
+    to_side = _TO_SIDE_LIGHT * (math.copysign(1.0, leaning), 1.0, 1.0) / np.linalg.norm(_TO_SIDE_LIGHT)
+    # Normals are in the world: rather than each of them, the lights are turned.
+    lights = np.stack((_HEADLIGHT * _TO_VIEWER, _SIDE_LIGHT * to_side)) @ camera.rotation
+    picture = np.full((*view.face.shape, 3), _BACKDROP, dtype=np.uint8)
+    in_bands(_lit, len(picture), view.face, normals, front, lights, _COLOURS, picture, rows_at_least=_ROWS_AT_LEAST)
+    return np.asarray(resized(picture, camera.size), dtype=np.uint8)
+
+
+def resized(picture: Pixels, size: Size) -> Pixels:
+    """The picture, (H, W) or (H, W, 3), at another size; itself if it has that size."""
+    if picture.shape[:2] == size.shape:
+        return picture
+    larger = size.width_px > picture.shape[1]
+    how = cv2.INTER_NEAREST if larger else cv2.INTER_AREA
+    return np.asarray(cv2.resize(picture, (size.width_px, size.height_px), interpolation=how))
+
+
+@kernel
+def _lit(first: int, last: int, face: Any, normals: Any, front: Any, lights: Any, colours: Any, picture: Any) -> None:
+    """Fill the rows from first to last where a triangle is seen: of each light, (2, 3), what falls on the normal."""
+    for row in range(first, last):
+        for column in range(face.shape[1]):
+            if face[row, column] < 0:
+                continue
+            light = _DARK
+            for number in range(2):
+                falling = 0.0
+                for axis in range(3):
+                    falling += lights[number, axis] * normals[row, column, axis]
+                light += max(falling, 0.0)
+            side = 0 if front[row, column] else 1
+            for channel in range(3):
+                picture[row, column, channel] = min(light * colours[side, channel], 255.0)
+
 
 _PANEL_PX = 520
 _PANEL_HEIGHT_PX = 640
@@ -321,3 +425,91 @@ def _text(picture: Picture, text: str, at: tuple[int, int]) -> None:
 
 def _text_width(text: str) -> int:
     return int(cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)[0][0])
+
+
+_NEUTRAL = 128
+_BORDER_PX = 2.0  # from the middle of the outermost: light falls there by a third, and beyond by less than a hundredth
+
+
+@dataclass(frozen=True, slots=True)
+class Coloured:
+    """colour : (n, 3) uint8, sRGB; mark : (n,) uint8, `AlbedoMark`; found : what the colours come from."""
+
+    colour: NDArray[np.uint8]
+    mark: NDArray[np.uint8]
+    found: Albedo
+
+
+def coloured(
+    cameras: Sequence[CameraResult],
+    joined: MergedCurves,
+    normals: NDArray[np.float32],
+    projector: Pinhole | None,
+    axis: Axis,
+    /,
+    light: LightMap | None = None,
+) -> Coloured:
+    """Colour each point by the camera that it counts as seen by. normals : (n, 3), unit, NaN where not known."""
+    curves, nowhere = joined.curves, np.zeros(len(joined.camera), dtype=np.bool_)
+    border = nowhere if projector is None else _at_border(curves, projector, axis)
+    points = AlbedoSamples(
+        curves.points_mm, normals, curves.pixels_px, joined.camera, curves.source == Source.ALL, border
+    )  # fmt: skip
+    views = [
+        Illumination(seen.device, seen.contrast, seen.clipped, seen.curves.refusal == Refusal.NONE) for seen in cameras
+    ]
+    if projector is None:
+        found = estimate_albedo(points, views, None)
+    else:
+        channels = max(view.contrast.shape[2] for view in views)
+        shares = None if light is None else light.light(places_px(curves, axis), projector.size, channels)
+        found = estimate_albedo(points, views, projector.centre_mm, light=shares)
+    colour = linear_to_srgb(found.value)
+    colour[found.mark == AlbedoMark.UNKNOWN] = _NEUTRAL
+    return Coloured(np.repeat(colour, 3, axis=1) if colour.shape[1] == 1 else colour, found.mark, found)
+
+
+def places_px(curves: SheetCurves, axis: Axis) -> NDArray[np.float64]:
+    """(n, 2) float64: (column, row) of the projector's image that lights each point."""
+    pair = np.repeat(curves.position_px, np.diff(curves.offsets)), curves.along_px
+    return np.stack(pair if axis is Axis.COLUMN else pair[::-1], axis=1)
+
+
+def _at_border(curves: SheetCurves, projector: Pinhole, axis: Axis) -> NDArray[np.bool_]:
+    """(n,) bool: points in the projector's outermost pixels."""
+    across, along = projector.size.along(axis), projector.size.along(axis.other)
+    outermost = _within(curves.position_px, across)
+    return np.asarray(np.repeat(outermost, np.diff(curves.offsets)) | _within(curves.along_px, along))
+
+
+def _within(place_px: NDArray[np.float64], length_px: int) -> NDArray[np.bool_]:
+    return np.asarray((place_px < _BORDER_PX) | (place_px > length_px - 1 - _BORDER_PX))
+
+
+def albedo_report(
+    coloured: Coloured, mesh: Mesh, cameras: Sequence[CameraResult], *, lit: bool, mapped: bool
+) -> dict[str, object]:
+    """The report's section on colours: what they are, their scale, and the vertices whose colour is in doubt, by cause.
+
+    `camera_gains` are by which the first camera sees light larger, and how many points told so; 0: none did, and the
+    cameras were brought to the same median. lit : whether the projector's place is known; mapped : its light over its
+    image, too.
+    """
+    counts = np.bincount(mesh.mark, minlength=len(AlbedoMark))
+    known = coloured.mark != AlbedoMark.UNKNOWN
+    return {
+        "channels": coloured.found.value.shape[1],
+        "is": "albedo: (white - black) * distance^2 / cosine of incidence at the projector"
+        if lit
+        else "brightness: white - black, because the projector is not calibrated",
+        "projector_light": "as measured on a white board"
+        if mapped
+        else "taken as even over its image; what is white in colour is not known",
+        "scale": {"percentile": BRIGHT_PERCENT, "albedo": BRIGHT_ALBEDO},
+        "brighter_than_white": round(float((coloured.found.value[known] > 1).any(axis=1).mean()), 4),
+        "marked_vertices": {mark.name.lower(): int(counts[mark]) for mark in AlbedoMark if mark is not AlbedoMark.NONE},
+        "camera_gains": {
+            seen.name: {"gain": gain.round(4).tolist(), "points": shared}
+            for seen, gain, shared in zip(cameras, coloured.found.gains, coloured.found.shared, strict=True)
+        },
+    }

@@ -1,17 +1,54 @@
-"""What a scan is asked to do: frozen data, made once from a request and a rig file; and who is told how far it is."""
+"""The plan of a scan: frozen values from a request, a preset and a rig file; the patterns that it means on a rig; and
+whether the devices can do it.
+"""
 
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime, timedelta
+from enum import StrEnum
+from math import asin, degrees
+from pathlib import Path
 from typing import Protocol
 from uuid import UUID
 
-from slrig.bundle import TurnedBy
-from slrig.errors import ConfigError, setting
-from slrig.model import Axis, FlipRule, Region, SequenceName, bracket_fault
-from slrig.patterns import SEQUENCES, SequenceOptions
+from slrig.bundle import (
+    MAX_CAPTURE_BYTES,
+    PRESET_NAME,
+    Preset,
+    PresetDocument,
+    TurnedBy,
+    json_bytes,
+    read_json_model,
+    write_file,
+)
+from slrig.devices import CameraInfo, ProjectorInfo, Rig
+from slrig.disk import storage_errors
+from slrig.errors import ConfigError, PatternError, PresetNotFoundError, UnsupportedByDeviceError, setting
+from slrig.model import (
+    MIN_BASELINE_FRACTION,
+    Axis,
+    Black,
+    Calibration,
+    FlipRule,
+    Pattern,
+    PatternSequence,
+    Pinhole,
+    Region,
+    SequenceName,
+    Sine,
+    Size,
+    White,
+    baseline_fraction,
+    bracket_fault,
+    depth_sensitive_cameras,
+    triangulated_axis,
+)
+from slrig.patterns import SEQUENCES, SequenceOptions, encode, phase_patterns, scan_patterns, with_cross_lines
+from slrig.rig.session import RigFacts
 
 _OF_LINES = (
     "line_shift", "line_shift_period_px", "line_steps", "line_width_px", "gray_cell_px", "gray_offset_px", "inverses",
@@ -41,7 +78,7 @@ class PatternPlan:
     sine_period_px : of the shortest sinusoid of the sequence `phase`; sine_steps : shifts of each.
     inverses : each bit is followed by its inverse; None stands for True unless lines of half their period prove bits.
     rows : True plays columns and rows, False columns alone, and None what the calibration asks for: columns for
-    devices side by side, rows for devices above one another; see `slrig.scan.light_axis.played_axes`. cross_lines :
+    devices side by side, rows for devices above one another; see `slrig.scan.plan.played_axes`. cross_lines :
     where one axis is played, one frame of lines along the other, which tests the calibration. codes : False
     plays white and black alone: enough for poses that calibrate cameras without the projector, and for no scan.
     """
@@ -278,3 +315,370 @@ def series_of(plan: ScanPlan, series: UUID, *, count: int, every_s: float, begin
         replace(plan, series=SeriesPlace(series, 1 + index, count, begins_at + timedelta(seconds=index * every_s)))
         for index in range(count)
     )
+
+
+_NEXT_TO_NONE = 0.01
+FAIR_SHARE = 0.5
+"""By this share of it (30°), errors are twice as large as they need be."""
+
+_BOTH = f"Scan with both axes: {setting('rows')}"
+
+
+def played_axes(
+    rows: bool | None, calibration: Calibration | None, names: Iterable[str], *, axis: Axis | None = None
+) -> tuple[Axis, ...]:
+    """The axes that a scan with the cameras `names` plays.
+
+    rows : True plays both, False columns alone; None the one that the calibration asks for, and columns without one.
+    axis : the one to triangulate by, if that was asked for.
+
+    Raises
+    ------
+    PatternError
+        The axis asked for tells no depth by the calibration, or columns alone are to be played and rows to be used.
+    """
+    if rows:
+        return tuple(Axis)
+    if axis is Axis.ROW and rows is False:
+        message = (
+            f"{setting('rows')} as false plays columns alone, and {setting('axis')} as row triangulates by rows; leave "
+            "one of them out"
+        )
+        raise PatternError(message)
+    cameras = _known(calibration, names)
+    wanted = Axis.COLUMN if rows is False else axis
+    if calibration is None or not cameras:
+        return (wanted or Axis.COLUMN,)
+    if wanted is None:
+        return (triangulated_axis(cameras, calibration.projector),)
+    return (chosen_axis((wanted,), cameras, calibration.projector),)
+
+
+def chosen_axis(shown: Collection[Axis], cameras: Sequence[Pinhole], projector: Pinhole | None) -> Axis:
+    """The axis to triangulate by, of those that were shown.
+
+    Raises
+    ------
+    PatternError
+        The only one shown tells no depth. Without a projector the stripes have to be seen before that can be said.
+    """
+    if len(shown) != 1:
+        return triangulated_axis(cameras, projector)
+    (axis,) = shown
+    if projector is not None and baseline_fraction(axis, cameras, projector) < MIN_BASELINE_FRACTION:
+        where = "above or below" if axis is Axis.COLUMN else "beside"
+        message = (
+            f"expected patterns across the baseline, found those of {axis}s alone: the camera stands {where} the "
+            f"projector, and light of one {axis} is seen edge on there and tells no depth. {_BOTH}"
+        )
+        raise PatternError(message)
+    return axis
+
+
+def weakness(axis: Axis, shown: Collection[Axis], share: float, *, on_request: bool = False) -> str | None:
+    """What to say of a scan whose stripes cross the baseline by so small a share; None where that is well.
+
+    on_request : True if this axis was requested. Then the other one, if it was shown, is the cure.
+    """
+    if share >= FAIR_SHARE:
+        return None
+    if len(shown) == 1:
+        cure = _BOTH
+    elif on_request:
+        cure = f"The {axis.other}s were played, too, and cross it more steeply: leave out {setting('axis')}"
+    else:
+        cure = "Both axes were played: turn the projector about its view by 45°"
+    times = f"{1 / share:.1f}" if share > _NEXT_TO_NONE else f"more than {1 / _NEXT_TO_NONE:.0f}"
+    return (
+        f"the light of the {axis}s crosses the baseline at {degrees(asin(share)):.0f}° only, and depth is {times} "
+        f"times as uncertain as it would be across it. {cure}"
+    )
+
+
+def left_out_notes(axis: Axis, cameras: Mapping[str, Pinhole], projector: Pinhole | None) -> list[str]:
+    """One sentence for each camera that the axis tells no depth, where it tells others."""
+    if projector is None:
+        return []
+    told = depth_sensitive_cameras(axis, list(cameras.values()), projector)
+    return [
+        f"camera '{name}' is left out: its baseline to the projector lies along the {axis}s of light, which tell it no "
+        "depth; the other cameras measure by them"
+        for name, tells in zip(cameras, told, strict=True)
+        if not tells
+    ]
+
+
+def _known(calibration: Calibration | None, names: Iterable[str]) -> list[Pinhole]:
+    return [] if calibration is None else [calibration.cameras[n] for n in names if n in calibration.cameras]
+
+
+def pattern_sequence(
+    plan: PatternPlan,
+    size: Size,
+    calibration: Calibration | None = None,
+    cameras: Iterable[str] = (),
+    *,
+    axis: Axis | None = None,
+    recorded: tuple[Pattern, ...] = (),
+    coloured_light: bool = False,
+) -> PatternSequence:
+    """The patterns that a plan means on a projector of this size, with these cameras. Raises PatternError.
+
+    axis : the one to triangulate by, if that was asked for. recorded : of `ProjectorInfo`; they are played unless the
+    plan asks for patterns of its own. coloured_light : of `ScanPlan`.
+    """
+    if recorded and plan == PatternPlan():
+        return encode(recorded, size)
+    axes = played_axes(plan.rows, calibration, cameras, axis=axis)
+    named = plan.named
+    rows, columns = (plan.codes and axis in axes for axis in (Axis.ROW, Axis.COLUMN))
+    if named.sines:
+        patterns = phase_patterns(
+            size, period_px=named.period_px, steps=named.steps, rows=rows, columns=columns,
+            coloured_light=coloured_light,
+        )  # fmt: skip
+    else:
+        patterns = scan_patterns(
+            size,
+            line_shift=plan.line_shift,
+            period_px=named.period_px,
+            steps=named.steps,
+            inverses=named.inverses,
+            closing=named.closing,
+            line_width_px=named.line_width_px,
+            gray_cell_px=plan.gray_cell_px,
+            gray_offset_px=plan.gray_offset_px,
+            rows=rows,
+            columns=columns,
+            coloured_light=coloured_light,
+        )
+    if plan.cross_lines and rows != columns:
+        patterns = with_cross_lines(patterns, Axis.COLUMN if rows else Axis.ROW)
+    return encode(patterns, size)
+
+
+def rig_sequence(plan: ScanPlan, rig: Rig) -> PatternSequence:
+    """The patterns of a scan on an open rig. Raises PatternError."""
+    projector = rig.projector.info
+    return pattern_sequence(
+        plan.patterns, projector.size, rig.calibration, rig.cameras, axis=plan.reconstruction.axis,
+        recorded=projector.recorded, coloured_light=plan.coloured_light,
+    )  # fmt: skip
+
+
+def in_colour(plan: ScanPlan, cameras: Mapping[str, CameraInfo], projector: ProjectorInfo) -> frozenset[str]:
+    """The cameras whose white and black frames a plan keeps in colour.
+    Raises UnsupportedByDeviceError: it asks for colour, and a camera has none; or for coloured light, and the projector
+    has none, or no camera needs it.
+    """
+    mono = [name for name, camera in cameras.items() if not camera.colour]
+    if plan.colour and mono:
+        message = (
+            f"{setting('colour')}: asked for, and camera '{mono[0]}' has none in the format that it is read in. Leave "
+            "it out, and the cameras that have colour give it."
+        )
+        raise UnsupportedByDeviceError(message)
+    kept = frozenset(cameras if plan.colour is not False else ()).difference(mono)
+    if plan.coloured_light and not projector.lights:
+        message = (
+            f"{setting('coloured_light')}: asked for, and the projector '{projector.model}' has no lights of its own "
+            "for red, green and blue that its driver could switch. Leave it out; a camera that has colour gives it."
+        )
+        raise UnsupportedByDeviceError(message)
+    if plan.coloured_light and len(kept) == len(cameras):
+        message = f"{setting('coloured_light')}: asked for, and every camera has colour already. Leave it out."
+        raise UnsupportedByDeviceError(message)
+    return kept
+
+
+def no_turntable(turn_deg: float) -> UnsupportedByDeviceError:
+    """The error that a rig cannot turn what stands before it."""
+    message = (
+        f"{setting('turn_deg')}: the object is to stand at {turn_deg:g}°, and this rig has no turntable. Turn it by "
+        f"hand, and say so with {setting('turned_by')}; or name a turntable in the rig file"
+    )
+    return UnsupportedByDeviceError(message)
+
+
+def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None = None) -> int:
+    """Return the bytes that the frames of a scan take on this rig, uncompressed. calibration : that it is to use.
+
+    Raises
+    ------
+    PatternError
+        The patterns do not fit the projector, or by the calibration they tell no depth.
+    ConfigError
+        The region names a camera that is not there, or a mask of another extent.
+    UnsupportedByDeviceError
+        A camera cannot expose that long, or that briefly, or has no colour, or the frames are more than a bundle holds.
+        Or there is no turntable to turn, or the projector shows no shades of grey.
+    """
+    if plan.turn_deg is not None and plan.turned_by == "table" and not facts.turntable:
+        raise no_turntable(plan.turn_deg)
+    exposures_s = plan.rising_exposures_s
+    if plan.reconstruction.region is not None:
+        plan.reconstruction.region.require_fits({name: each.format.size for name, each in facts.cameras.items()})
+    axis = plan.reconstruction.axis
+    projector = facts.projector
+    sequence = pattern_sequence(
+        plan.patterns, projector.size, calibration, facts.cameras, axis=axis, recorded=projector.recorded,
+        coloured_light=plan.coloured_light,
+    )  # fmt: skip
+    if not projector.shades and any(isinstance(each, Sine) for each in sequence.patterns):
+        message = (
+            f"{setting('sequence')}: {plan.patterns.sequence} plays sinusoids, and the projector '{projector.model}' "
+            "shows black and white alone. Ask for standard or fast, or connect its video input and drive it as a "
+            "display (driver screen or kms in the rig file), which shows shades of grey"
+        )
+        raise UnsupportedByDeviceError(message)
+    count, coloured = len(sequence) * plan.exposure_count, in_colour(plan, facts.cameras, projector)
+    ends = sum(isinstance(each, White | Black) for each in sequence.patterns) * plan.exposure_count
+    key = "exposure_s" if plan.exposures_s is None else "exposures_s"
+    total = 0
+    for name, camera in facts.cameras.items():
+        least_s, most_s = camera.exposure_range_s
+        for asked_s in exposures_s:
+            if not least_s <= asked_s <= most_s:
+                message = (
+                    f"{key}: {asked_s:g} s was asked for, camera '{name}' can do {least_s:g} s to {most_s:g} s. "
+                    "Ask for a value in that range."
+                )
+                raise UnsupportedByDeviceError(message)
+        size = camera.format.size
+        images = count + (3 * ends if name in coloured else 0)
+        total += images * size.width_px * size.height_px * (1 if camera.format.bit_depth <= 8 else 2)
+    if total > MAX_CAPTURE_BYTES:
+        message = (
+            f"The frames of this scan would take {total / 1e9:.1f} GB, a bundle holds {MAX_CAPTURE_BYTES / 1e9:.1f} "
+            "GB at most. Ask for fewer exposures or fewer patterns."
+        )
+        raise UnsupportedByDeviceError(message)
+    return total
+
+
+MOST_PRESET_BYTES = 2**20
+
+SHIPPED: Mapping[str, Preset] = {
+    "matt": Preset(description="matt and light: plaster, paint, 3-D prints", exposure_factors=(1.0,)),
+    "dark": Preset(description="dark, with lighter parts: rubber, black plastic", exposure_factors=(1.0, 8.0)),
+    "shiny": Preset(description="glossy: machined metal, varnish", exposure_factors=(0.25, 2.0)),
+    "mixed": Preset(description="dark here and shining there", exposure_factors=(0.0625, 0.5, 4.0)),
+    "fast": Preset(
+        description="least time, for matt and light objects", exposure_factors=(0.5,), sequence=SequenceName.FAST
+    ),
+    "precise": Preset(
+        description="least noise, for objects that stand still",
+        exposure_factors=(0.0625, 0.25, 1.0, 4.0),
+    ),
+}
+"""Factors, because seconds mean nothing on another rig: they are of the exposure at which a light matt object comes
+near full scale, as a rig's own is set. Chosen by `tests/bench/preset_sweep.py`; README.md has what they measured.
+"""
+
+
+class PresetSource(StrEnum):
+    """Where a preset comes from."""
+
+    SHIPPED = "shipped"
+    RIG = "rig"
+    KEPT = "kept"
+
+
+_WORDS = {PresetSource.SHIPPED: "slrig itself", PresetSource.RIG: "the rig file"}
+
+
+@dataclass(frozen=True, slots=True)
+class NamedPreset:
+    """A preset by its name. digest : of its options; see `PresetDocument`. fault : what is wrong with its file; there
+    are no options then.
+    """
+
+    name: str
+    source: PresetSource
+    description: str | None = None
+    digest: str | None = None
+    fault: str | None = None
+
+
+class Presets:
+    """The presets of a service. Any thread may call.
+
+    folder : where those are kept that were put, one file each; made when there is need. of_rig : those of the rig file.
+    """
+
+    def __init__(self, folder: Path, of_rig: Mapping[str, Preset]) -> None:
+        self._folder = folder
+        self._given = {
+            **{name: (PresetSource.SHIPPED, preset) for name, preset in SHIPPED.items()},
+            **{name: (PresetSource.RIG, preset) for name, preset in of_rig.items()},
+        }
+
+    def listed(self) -> list[NamedPreset]:
+        """All that there are, by name."""
+        kept = self._kept()
+        found = []
+        for name in sorted(kept | set(self._given)):
+            source = PresetSource.KEPT if name in kept else self._given[name][0]
+            try:
+                document = self.get(name)
+            except PresetNotFoundError:
+                # It was deleted meanwhile.
+                continue
+            except ConfigError as error:
+                found.append(NamedPreset(name, source, fault=str(error)))
+            else:
+                found.append(NamedPreset(name, source, document.scan.description, document.digest))
+        return found
+
+    def get(self, name: str) -> PresetDocument:
+        """The preset of a name.
+
+        Raises
+        ------
+        PresetNotFoundError
+            There is none.
+        ConfigError
+            Its file was changed and is none any more, or is of another version.
+        """
+        path = self._path(name)
+        if path.is_file():
+            return read_json_model(path, PresetDocument, "preset", max_bytes=MOST_PRESET_BYTES, error=ConfigError)
+        if name not in self._given:
+            names = ", ".join(sorted(self._kept() | set(self._given)))
+            message = f"There is no preset '{name}' here. There are: {names}."
+            raise PresetNotFoundError(message)
+        return PresetDocument(scan=self._given[name][1])
+
+    def put(self, name: str, document: PresetDocument) -> None:
+        """Keep a preset, in place of what has its name. Raises StorageError."""
+        with storage_errors(self._folder):
+            self._folder.mkdir(mode=0o750, exist_ok=True)
+        write_file(self._path(name), json_bytes(document.model_dump(mode="json", exclude_none=True)))
+
+    def delete(self, name: str) -> None:
+        """Remove a preset that was put; one of the rig file or a shipped one of its name is then seen again.
+
+        Raises
+        ------
+        PresetNotFoundError
+            None was put by that name.
+        StorageError
+            The disk refused.
+        """
+        path = self._path(name)
+        if not path.is_file():
+            self.get(name)
+            message = (
+                f"Preset '{name}' is not kept here, but comes from {_WORDS[self._given[name][0]]}, and cannot be "
+                "deleted. One that is PUT by its name takes its place."
+            )
+            raise PresetNotFoundError(message)
+        with storage_errors(path):
+            path.unlink(missing_ok=True)
+
+    def _kept(self) -> set[str]:
+        """The names of those that were put; a file of another name was put there by hand, and nobody can ask for it."""
+        return {path.stem for path in self._folder.glob("*.json") if re.fullmatch(PRESET_NAME, path.stem)}
+
+    def _path(self, name: str) -> Path:
+        return self._folder / f"{name}.json"

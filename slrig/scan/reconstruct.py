@@ -1,4 +1,4 @@
-"""The second half of a scan, walked: the one file where the rooms of its mathematics meet.
+"""Reconstruction of a scan from its bundle: the order of the steps, from frames to the files of the result.
 
 A live scan is recorded as a bundle first (`slrig.scan.acquisition`), so that what was measured can always be computed
 again.
@@ -11,38 +11,110 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
+import tifffile
 from numpy.typing import NDArray
 
-from slrig.bundle import read_health, read_notes, read_truth, read_turntable_angle, write_file
+from slrig.bundle import read_capture, read_health, read_notes, read_truth, read_turntable_angle, write_file
 from slrig.capture import EvidenceSummary
-from slrig.errors import NothingToReconstructError, ScanCancelledError
-from slrig.jobs.frame_feed import FedFrames
-from slrig.jobs.versions import computed
+from slrig.disk import storage_errors
+from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, ScanCancelledError, setting
+from slrig.jobs.database import computed
+from slrig.jobs.job import FedFrames
 from slrig.kernels import KernelCount, report_compilations, trim_malloc
-from slrig.meshing import MeshingLimits, MeshStage, Viewpoints, build_surface, compact_mesh, mesh_figures, score
-from slrig.model import FloatArray, IntArray, Mesh, PointCurves, Region, Source
+from slrig.meshing import (
+    MeshingLimits,
+    MeshStage,
+    Viewpoints,
+    build_surface,
+    compact_mesh,
+    covered_pixels,
+    depth_ranges,
+    mesh_figures,
+    score,
+)
+from slrig.model import (
+    AlbedoMark,
+    Axis,
+    Calibration,
+    Capture,
+    FloatArray,
+    Gray,
+    IntArray,
+    LightMap,
+    Mesh,
+    NoiseModel,
+    PointCurves,
+    Refusal,
+    Region,
+    Sine,
+    Size,
+    Source,
+    light_map_coordinates,
+    trim_incomplete_codes,
+)
+from slrig.patterns import cell_positions, index_of_word, require_numbered
 from slrig.reconstruction import (
+    AxisFrames,
+    DecodingLimits,
     MergedCurves,
+    SheetCurves,
+    axis_frames,
+    decode_edges,
+    decode_sinusoids,
+    estimate_noise,
+    exposure_count,
+    fuse_exposures,
+    lit_pixels,
+    optical_depths_mm,
+    position_map,
     project,
     sampling_mm,
     sigma_along_normal,
 )
-from slrig.scan.artefacts import MESH, REPORT, encode_mesh_ply, encode_points_ply, encode_report, staged_folder
-from slrig.scan.axis_agreement import agreement_report, axis_test
-from slrig.scan.colouring import albedo_report, coloured
-from slrig.scan.coverage import covered_share, layered_share, with_uncovered_refused
-from slrig.scan.limited import marked, within
-from slrig.scan.losses import LossStage, coverage_notes, require_coverage, require_surface
-from slrig.scan.measured import Walked, measured
-from slrig.scan.mesh_formats import encode_mesh_glb
-from slrig.scan.mirror_images import mirror_image_notes, without_mirror_images, without_surface
-from slrig.scan.offered import agreement_picture as agreement_name
-from slrig.scan.offered import causes_picture, rejected_picture
+from slrig.scan.agreement import agreement_report, axis_test
+from slrig.scan.artefacts import (
+    MESH,
+    REPORT,
+    REPORT_FORMAT,
+    encode_mesh_ply,
+    encode_points_ply,
+    encode_report,
+    fault_notes,
+    layer_notes,
+    staged_folder,
+    truth_notes,
+    write_report,
+)
+from slrig.scan.formats import agreement_picture as agreement_name
+from slrig.scan.formats import causes_picture, encode_mesh_glb, rejected_picture
+from slrig.scan.losses import (
+    LossStage,
+    coverage_notes,
+    mirror_image_notes,
+    require_coverage,
+    require_surface,
+    without_mirror_images,
+    without_surface,
+)
+from slrig.scan.measured import (
+    Entered,
+    Triangulated,
+    Walked,
+    calibration_sigma_mm,
+    curve_spacing,
+    disagreement_sigma_mm,
+    measured,
+)
 from slrig.scan.pictures import (
     agreement_picture,
+    albedo_report,
+    coloured,
     described_causes,
     encode_png,
+    placed_vertices,
+    places_px,
     preview,
     rejection_picture,
     rejection_size,
@@ -59,9 +131,49 @@ from slrig.scan.report import (
     view_report,
     with_seconds,
 )
-from slrig.scan.soundness import fault_notes, layer_notes, truth_notes
-from slrig.scan.stream import CameraResult, LiveScan
-from slrig.scan.triangulated import Triangulated, calibration_sigma_mm, curve_spacing, disagreement_sigma_mm
+from slrig.scan.stream import CameraResult, LiveScan, marked, within
+
+_PICTURE_PX = 480
+"""Wide enough for a share, and a tenth of the work at full size."""
+
+
+def with_uncovered_refused(mesh: Mesh, seen: CameraResult) -> CameraResult:
+    """The camera with the decoded pixels that no triangle of the mesh covers among its refusals."""
+    covered = covered_pixels(placed_vertices(mesh.vertices_mm, seen.device), mesh.faces, seen.device.size)
+    refusal = seen.curves.refusal
+    bare = (refusal == Refusal.NONE) & ~covered
+    return replace(seen, curves=replace(seen.curves, refusal=np.where(bare, np.uint8(Refusal.NO_SURFACE), refusal)))
+
+
+def covered_share(seen: CameraResult) -> float | None:
+    """The share of the pixels without another cause that the mesh covers; None without such pixels. seen : a result of
+    `with_uncovered_refused`.
+    """
+    covered, bare = (np.count_nonzero(seen.curves.refusal == each) for each in (Refusal.NONE, Refusal.NO_SURFACE))
+    return covered / (covered + bare) if covered + bare else None
+
+
+def _sampled_every(width_px: int) -> int:
+    return max(1, -(-width_px // _PICTURE_PX))
+
+
+def layered_share(
+    seen: CameraResult, curves: SheetCurves, mine: NDArray[np.bool_], faces: IntArray, least_mm: float
+) -> float:
+    """The share of a mesh's image in a camera where two of its triangles lie one behind the other.
+
+    Counted on a picture of at most 480 pixels' width. mine : (n,) bool, the points that this camera alone measured
+    (others are moved in its image): triangles with others do not count. faces : (F, 3) int32 into the points.
+    least_mm : smaller distances are folds of noise.
+    """
+    size = seen.device.size
+    step = _sampled_every(size.width_px)
+    faces = faces if mine.all() else faces[mine[faces].all(axis=1)]
+    placed = np.column_stack((curves.pixels_px / step, optical_depths_mm(seen.device, curves.points_mm)))
+    nearest, furthest = depth_ranges(placed, faces, Size(size.width_px // step, size.height_px // step))
+    covered = int(np.count_nonzero(nearest <= furthest))
+    return int(np.count_nonzero(furthest - nearest > least_mm)) / max(covered, 1)
+
 
 _BETWEEN = frozenset({"read bundle", "check frames"})
 """What is done with each frame between other stages."""
@@ -132,7 +244,7 @@ def reconstruct_into(
 
     `live` has taken the frames already while they were captured; where it is of this bundle they are not read again.
     judged : what the frames proved as they were captured, so that they need not be judged again.
-    where : `slrig.jobs.worker_process.Task.where`, for the report.
+    where : `slrig.jobs.worker.Task.where`, for the report.
 
     Writes mesh.ply first, then mesh.glb and points.ply, then preview.png, two pictures of the refused pixels
     per camera, and report.json. Each file appears whole, and `made` is told its name; whoever keeps the folder has to
@@ -238,7 +350,7 @@ def reconstruct_into(
 
 
 def frame_receiver() -> FedFrames:
-    """What takes the frames of a capture while they come: see `slrig.jobs.worker_process.serve`."""
+    """What takes the frames of a capture while they come: see `slrig.jobs.worker.serve`."""
     return FedFrames(LiveScan)
 
 
@@ -404,3 +516,193 @@ def _compared_with_truth(
         pixels = np.clip(project(seen.device, visible), 0, np.array(seen.curves.refusal.shape[::-1]) - 1)
         visible = visible[within(region, visible, pixels, seen.curves.refusal, seen.device)]
     return {"truth": score(mesh, truth.surface, visible, *(each.device.centre_mm for each in cameras)).as_dict()}
+
+
+_FEW, _MANY = 0.05, 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """One camera and axis. Shares: lit, of the image; decoded, saturated, ambiguous and unresolved (the finest bit), of
+    what is lit. contrast : median of white less black over full scale, of what is lit.
+    """
+
+    camera: str
+    axis: Axis
+    lit: float
+    decoded: float
+    saturated: float
+    ambiguous: float
+    unresolved: float
+    contrast: float
+
+    def __str__(self) -> str:
+        lit = f"camera '{self.camera}', {self.axis.value}s: {self.lit:.0%} of the image is lit"
+        return f"{lit}, {self.decoded:.0%} of that decoded"
+
+    @property
+    def advice(self) -> list[str]:
+        """What to change, one sentence each."""
+        told = []
+        if self.lit < _FEW:
+            told.append("hardly anything is lit: do camera and projector look at the same place? Lengthen the exposure")
+        elif self.contrast < _FEW:
+            told.append("the light is weak: lengthen the exposure, open the lens, or darken the room")
+        if self.saturated > _FEW:
+            told.append(
+                f"{self.saturated:.0%} is saturated: shorten the exposure, or scan with "
+                f"several: {setting('exposures_s')}"
+            )
+        if self.unresolved > _FEW:
+            told.append(
+                f"the finest bit does not resolve on {self.unresolved:.0%}: look at the focus of camera and projector, "
+                f"or play wider cells: {setting('gray_cell_px')}"
+            )
+        if self.ambiguous > _MANY:
+            told.append(
+                f"bits are ambiguous on {self.ambiguous:.0%}: something moved, light is reflected from part to part, "
+                "or the surface is translucent or dark"
+            )
+        return told
+
+
+def decode_bundle(bundle: Path, output: Path) -> tuple[list[Decoded], tuple[str, ...]]:
+    """Decode a recorded bundle into `output`, which appears whole or not at all. With words for codes cut short.
+
+    Raises
+    ------
+    BundleError, PatternError
+        The frames cannot be read or decoded.
+    InvalidInputError, StorageError
+        `output` holds something else, or the disk refused.
+    """
+    capture, cut_short = trim_incomplete_codes(read_capture(bundle))
+    axes = [axis for axis in Axis if any(isinstance(p, Gray | Sine) and p.axis is axis for p in capture.patterns)]
+    if not axes:
+        message = f"{bundle}: no frames of Gray code or sinusoids: nothing can be decoded"
+        raise PatternError(message)
+    with staged_folder(output) as staging:
+        found = [_decoded(capture, camera, axis, staging) for camera in capture.cameras for axis in axes]
+        report: Mapping[str, object] = {
+            "format": REPORT_FORMAT,
+            "version": 1,
+            "method": "decoding only",
+            "notes": list(cut_short),
+            "decoded": [asdict(each) | {"axis": each.axis.value, "advice": each.advice} for each in found],
+        }
+        write_report(report, staging / REPORT)
+    return found, cut_short
+
+
+def _decoded(capture: Capture, camera: str, axis: Axis, folder: Path) -> Decoded:
+    frames, noise = _frames(capture, camera, axis)
+    limits = DecodingLimits()
+    lit = lit_pixels(frames, noise, limits)
+    words = index_of_word(frames.gray)
+    if frames.sine_patterns:
+        if not len(frames.bits):
+            require_numbered(frames.sine_patterns, capture.projector)
+        found = decode_sinusoids(frames, noise, words, capture.projector.along(axis), limits)
+        code, position, unresolved = found.code, found.measured.position, np.zeros(lit.shape, dtype=np.uint8)
+    else:
+        cells = cell_positions(frames.gray, capture.projector)
+        code, unresolved = decode_edges(frames, noise, words, len(cells), limits)
+        position = position_map(frames, noise, code, cells).position
+    name = f"{camera}-{axis.value}"
+    with storage_errors(folder):
+        tifffile.imwrite(folder / f"position-{name}.tiff", position)
+    coloured = encode_png(_coloured(position, capture.projector.along(axis)))
+    write_file(folder / f"position-{name}.png", coloured)
+    white = np.clip(np.rint(frames.white), 0, np.iinfo(np.uint16).max).astype(np.uint16)
+    refused = encode_png(rejection_picture(code.refusal, white, int(frames.clipped_at)))
+    write_file(folder / f"rejected-{name}.png", refused)
+    count = max(int(lit.sum()), 1)
+    return Decoded(
+        camera=camera,
+        axis=axis,
+        lit=float(lit.mean()),
+        decoded=float((code.refusal == Refusal.NONE).sum() / count),
+        saturated=float((lit & (frames.white >= frames.clipped_at)).sum() / count),
+        ambiguous=float((code.refusal == Refusal.AMBIGUOUS_BIT).sum() / count),
+        unresolved=float((lit & (unresolved > 0)).sum() / count),
+        contrast=float(np.median(frames.contrast[lit]) / frames.full_scale) if lit.any() else 0.0,
+    )
+
+
+def _frames(capture: Capture, camera: str, axis: Axis) -> tuple[AxisFrames, NoiseModel]:
+    if exposure_count({shot.exposure_s for shot in capture.shots if shot.camera == camera}) > 1:
+        fused = fuse_exposures(capture, camera, axis)
+        return fused.frames, fused.noise
+    frames = axis_frames(capture, camera, axis)
+    return frames, estimate_noise(frames)
+
+
+def _coloured(position: NDArray[np.float32], extent_px: int) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8, blue, green, red: from blue at the projector's first position to red at its last."""
+    known = np.isfinite(position)
+    grey = np.where(known, np.clip(np.nan_to_num(position) / extent_px, 0, 1) * 255, 0).astype(np.uint8)
+    picture = cv2.applyColorMap(grey, cv2.COLORMAP_TURBO)
+    picture[~known] = 0
+    return np.asarray(picture, dtype=np.uint8)
+
+
+_CELLS = 24  # along each side of the image: light is smooth over one, and noise and paper's grain are not
+_LEAST_POINTS = 10
+_MOST_SATURATED, _MOST_BENT, _MOST_UNSEEN, _MOST_UNEVEN = 0.02, 0.02, 0.75, 0.02
+_DEGREE = 4
+
+
+def with_light_map(bundle: Path, entered: Entered) -> Calibration:
+    """The calibration of a scan of a plain white board, with the projector's light as the board shows it.
+
+    What the board sends back, over cosine and squared distance, is the light's share; its logarithm is fitted by a
+    polynomial over the image, in each channel that the scan has. Between channels that makes the board white.
+
+    Raises
+    ------
+    CalibrationError
+        The scan has no calibrated projector, or is of no board: not flat, not even, overexposed, or it covers too
+        little of the projector's image. Further as `measured`.
+    """
+    walked, found = measured(bundle, None, None, entered, axis=None)
+    projector, curves = found.agreement.calibration.projector, found.merged.curves
+    if projector is None:
+        message = f"{bundle}: expected a scan by a calibrated projector, found none; calibrate the rig with it"
+        raise CalibrationError(message)
+    away = curves.points_mm - curves.points_mm.mean(axis=0)
+    extents, axes = np.linalg.eigh(away.T @ away)
+    normals = np.tile(axes[:, 0] * np.sign(axes[:, 0] @ (projector.centre_mm - curves.points_mm[0])), (len(away), 1))
+    seen = coloured(found.cameras, found.merged, normals.astype(np.float32), projector, walked.axis)
+    places = places_px(curves, walked.axis)
+    value, good = seen.found.value, (seen.mark == AlbedoMark.NONE) & (seen.found.value > 0).all(axis=1)
+    # Of each cell of the image: the mean place, and the mean logarithm of what the board sends back.
+    column, row = (np.clip((light_map_coordinates(places[good], projector.size) + 1) / 2, 0, 0.9999) * _CELLS).astype(
+        int
+    )
+    cell = row * _CELLS + column
+    counts = np.bincount(cell, minlength=_CELLS**2)
+    known = counts >= _LEAST_POINTS
+    middles, logs = (
+        np.stack([np.bincount(cell, each, _CELLS**2)[known] / counts[known] for each in values[good].T], axis=1)
+        for values in (places, np.log(np.maximum(value, 1e-9)))
+    )
+    powers = np.array([(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)])
+    terms = np.prod(light_map_coordinates(middles, projector.size).T[:, None] ** powers, axis=2)
+    fitted = np.linalg.lstsq(terms, logs, rcond=None)[0]
+    uneven = float(np.sqrt(((logs - terms @ fitted) ** 2).mean())) if known.any() else np.inf
+    saturated = float((seen.mark == AlbedoMark.SATURATED).mean())
+    bent, unseen = float(np.sqrt(max(extents[0], 0) / extents[2])), 1 - float(known.mean())
+    for much, most, words in (
+        (saturated, _MOST_SATURATED, "is saturated: expose for less"),
+        (bent, _MOST_BENT, "stands out of a plane: show a flat board alone"),
+        (unseen, _MOST_UNSEEN, "of the projector's image shows no board: use a larger or a nearer one"),
+        (uneven, _MOST_UNEVEN, "is left of a smooth fit: the board is stained, shines, or is not plain white"),
+    ):
+        if not much <= most:
+            message = f"{bundle}: expected a plain white board, found that {much:.1%} {words}; {most:.0%} may"
+            raise CalibrationError(message)
+    coefficients = np.zeros((logs.shape[1], _DEGREE + 1, _DEGREE + 1))
+    coefficients[:, powers[:, 0], powers[:, 1]] = fitted.T
+    coefficients[:, 0, 0] -= logs.mean()
+    light = LightMap(coefficients, np.array([middles.min(axis=0), middles.max(axis=0)]))
+    return replace(walked.devices, light=light)

@@ -1,17 +1,34 @@
-"""What nobody would see until it is too late, put into the outbox: runs that failed, a rig that moved."""
+"""Notices of what nobody would see until it is too late, such as failed runs and a rig that moved, and their receivers:
+the webhook, and those of plug-ins.
+"""
 
 from __future__ import annotations
 
-from typing import get_args
+import base64
+import binascii
+import hashlib
+import hmac
+import ssl
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import ClassVar, get_args
+from urllib.parse import urlsplit
 
+import structlog
+from pydantic import SecretStr
 from sqlalchemy.orm import Session
 
 from slrig.calibrate.verification import HealthStore, VerificationRecord
 from slrig.calibration.health import HealthState
-from slrig.config import NoticeKind
+from slrig.config import NoticeKind, ServiceSettings, read_private_text
+from slrig.errors import ConfigError, StorageError
 from slrig.jobs.database import Database
-from slrig.jobs.outbox import Outbox
-from slrig.schedule.records import RunState, Schedule, ScheduledRun
+from slrig.jobs.records import Clock, utc_now
+from slrig.jobs.store import Notice, Outbox
+from slrig.plugins import RECEIVERS, load
+from slrig.schedule.store import RunState, Schedule, ScheduledRun
 
 TOLD: dict[RunState, NoticeKind] = {
     RunState(kind.removeprefix("run.")): kind for kind in get_args(NoticeKind) if kind.startswith("run.")
@@ -73,3 +90,206 @@ class NoticedHealth(HealthStore):
                 "calibration": now.calibration,
             },
         )
+
+
+FIRST_WAIT_S = 1.0
+LONGEST_WAIT_S = 300.0
+TIMEOUT_S = 15.0
+"""For one try, from the connection to the head of the answer."""
+
+_END_S = 1.0
+_REFUSED_S = 5.0
+"""How long after the records refused they are looked at again."""
+
+_log = structlog.get_logger(__name__)
+
+
+class Sender(ABC):
+    """Sends notices on a thread of its own. Nothing waits for it, but `close`, for a second at most.
+
+    A notice is sent again until its receiver takes it, and then forgotten. receiver : its name in the outbox. host :
+    what logs say of its address.
+    """
+
+    receiver: ClassVar[str]
+
+    def __init__(self, outbox: Outbox, host: str) -> None:
+        self.host = host
+        self._outbox = outbox
+        self._news = outbox.news[self.receiver]
+        self._failures = 0
+        self._gone = self._left = False
+        self._taken: str | None = None
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._send_all, name="slrig-notices", daemon=True)
+
+    @abstractmethod
+    def refusal(self, notice: Notice) -> str | None:
+        """Send a notice once. Returns why it was not taken. May raise anything: the next try may get through."""
+
+    def start(self) -> None:
+        """Begin to send."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Send no more than what waits, and that only if it goes quickly. Idempotent."""
+        self._ending.set()
+        self._news.set()
+        if self._thread.is_alive():
+            self._thread.join(_END_S)
+        self._left = True
+
+    def step(self) -> float | None:
+        """Send the oldest notice that waits. Returns how many seconds to wait before the next step; None: until there
+        is one more. Raises StorageError.
+        """
+        notice = self._outbox.oldest(self.receiver)
+        if notice is None or self._gone:
+            return None if notice is None else LONGEST_WAIT_S
+        # One that could not be taken off the record is not sent again by this process.
+        if notice.id != self._taken:
+            try:
+                cause = self.refusal(notice)
+            except Exception as error:  # noqa: BLE001 - whatever it was, the next try may get through
+                cause = type(error).__name__
+            if cause is not None:
+                return self._failed(notice, cause)
+        self._taken, self._failures = notice.id, 0
+        if not self._left:
+            self._outbox.sent(notice)
+        return 0.0
+
+    def _failed(self, notice: Notice, cause: str) -> float:
+        told = {"receiver": self.receiver, "host": self.host, "cause": cause}
+        told["notice"] = notice.body["words"]
+        if self._gone:
+            _log.error("the receiver is gone: nothing is sent before the next start of the service", **told)
+            return LONGEST_WAIT_S
+        wait_s = min(FIRST_WAIT_S * 2.0 ** min(self._failures, 30), LONGEST_WAIT_S)
+        self._failures += 1
+        _log.warning("a notice was not delivered", tries=self._failures, again_in_s=wait_s, **told)
+        return wait_s
+
+    def _send_all(self) -> None:
+        while not self._left:
+            self._news.clear()
+            try:
+                wait_s = self.step()
+            except Exception as error:  # noqa: BLE001 - a full disk may be emptied; the notices wait
+                unexpected = not isinstance(error, StorageError)
+                _log.error("the notices could not be looked at", cause=str(error), exc_info=unexpected)
+                wait_s = _REFUSED_S
+            if wait_s is None and not self._ending.is_set():
+                self._news.wait()
+            elif wait_s is None or (wait_s > 0 and self._ending.wait(wait_s)):
+                return
+
+
+_GONE = 410
+_KEY_BYTES = range(24, 65)
+
+
+def signing_key(secret: str, source: str) -> bytes:
+    """The key that a secret stands for: Base64 of 24 to 64 bytes, with or without `whsec_` before it.
+
+    Raises ConfigError, which names the source and not the secret.
+    """
+    try:
+        key = base64.b64decode(secret.strip().removeprefix("whsec_"), validate=True)
+    except (binascii.Error, ValueError):
+        key = b""
+    if len(key) not in _KEY_BYTES:
+        message = (
+            f"{source}: expected whsec_ and Base64 of 24 to 64 random bytes. Make one: "
+            """python3 -c 'import base64, os; print("whsec_" + base64.b64encode(os.urandom(32)).decode())'"""
+        )
+        raise ConfigError(message)
+    return key
+
+
+def signature(key: bytes, notice_id: str, timestamp: int, body: bytes) -> str:
+    """What the header `webhook-signature` says: HMAC-SHA256 over `id.timestamp.body`.
+
+    >>> signature(b"k" * 24, "msg_1", 1614265330, b"{}")
+    'v1,KrbhoJST6Q+/bu1g6/FBBu+pIEtkrImj8aKkA5+3RXI='
+    """
+    digest = hmac.digest(key, f"{notice_id}.{timestamp}.".encode() + body, hashlib.sha256)
+    return f"v1,{base64.b64encode(digest).decode()}"
+
+
+class Webhook(Sender):
+    """Takes a notice by a status of 200 to 299. key : signs each; None sends them unsigned."""
+
+    receiver = "webhook"
+
+    def __init__(
+        self, outbox: Outbox, url: str, key: bytes | None, *, clock: Clock = utc_now, timeout_s: float = TIMEOUT_S
+    ) -> None:
+        # The rest of the address often holds a secret.
+        super().__init__(outbox, urlsplit(url).hostname or "")
+        self._url = url
+        self._key = key
+        self._clock = clock
+        self._timeout_s = timeout_s
+        self._tls: ssl.SSLContext | None = None
+
+    def refusal(self, notice: Notice) -> str | None:
+        """See `Sender`."""
+        timestamp = int(self._clock().timestamp())
+        headers = {"content-type": "application/json", "webhook-id": notice.id, "webhook-timestamp": str(timestamp)}
+        if self._key is not None:
+            headers["webhook-signature"] = signature(self._key, notice.id, timestamp, notice.content)
+        status = self._status(notice.content, headers)
+        self._gone = status == _GONE
+        return None if 200 <= status < 300 else f"status {status}"
+
+    def _status(self, body: bytes, headers: dict[str, str]) -> int:
+        # Loaded by those who use it.
+        import httpx2
+
+        if self._tls is None:
+            self._tls = httpx2.create_ssl_context()
+        with httpx2.Client(verify=self._tls, timeout=self._timeout_s, follow_redirects=False) as client:
+            # The client's own limit is for each piece of an answer, and one may come a byte at a time.
+            whole = threading.Timer(self._timeout_s, client.close)
+            whole.daemon = True
+            whole.start()
+            try:
+                # What a receiver says beyond the status is not read.
+                with client.stream("POST", self._url, content=body, headers=headers) as answer:
+                    return answer.status_code
+            finally:
+                whole.cancel()
+
+
+def wanted_kinds(settings: ServiceSettings) -> Mapping[str, Collection[NoticeKind]]:
+    """Kinds of notices for each named receiver; all kinds for other receivers than the webhook. Raises ConfigError."""
+    kinds = dict.fromkeys(_named_receivers(settings), get_args(NoticeKind))
+    return kinds if settings.webhook_url is None else {"webhook": settings.webhook_kinds, **kinds}
+
+
+def senders_of(settings: ServiceSettings, outbox: Outbox) -> list[Sender]:
+    """One sender for each receiver. Raises ConfigError: an address or secret is invalid, or an extra is missing."""
+    found: list[Sender] = []
+    if settings.webhook_url is not None:
+        secret, source = secret_of(settings.webhook_secret, settings.webhook_secret_file, "webhook_secret")
+        found.append(Webhook(outbox, settings.webhook_url, None if secret is None else signing_key(secret, source)))
+    return [*found, *(open_sender(settings, outbox) for open_sender in _named_receivers(settings).values())]
+
+
+def _named_receivers(settings: ServiceSettings) -> Mapping[str, Callable[[ServiceSettings, Outbox], Sender]]:
+    """The plug-ins of the settings `X_url`. Raises ConfigError: one is not installed, or cannot be loaded."""
+    installed = load(RECEIVERS)
+    found = {name: installed[name] for name in installed if getattr(settings, f"{name}_url", None) is not None}
+    if settings.mqtt_url is not None and "mqtt" not in found:
+        message = "mqtt_url: no installed package sends notices there; install slrig again, or leave mqtt_url out"
+        raise ConfigError(message)
+    return found
+
+
+def secret_of(given: SecretStr | None, path: Path | None, name: str) -> tuple[str | None, str]:
+    """Return a secret, or the contents of a file that only its owner may read, and its source. Raises ConfigError."""
+    if given is not None or path is None:
+        return None if given is None else given.get_secret_value(), name
+    source = f"{name}_file: {path}"
+    return read_private_text(path, source), source

@@ -1,27 +1,47 @@
-"""Keeps the schedule: looks at the clock, starts what is due, and records what became of it."""
+"""The scheduler, which starts what is due and records how it ended, and the work that schedules do with the rig."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime, timedelta
-from typing import Any
+from typing import Annotated, Any, Protocol, TypeVar
+from uuid import UUID
 
 import structlog
+from pydantic import Field, ValidationError
 
+from slrig.accept.evaluation import verdicts
+from slrig.accept.job import AcceptanceTests
+from slrig.accept.plan import AcceptanceRequest
+from slrig.accept.store import AcceptanceState
+from slrig.bundle import FreeText, Strict, describe_errors, model_keys
+from slrig.calibrate.job import Calibrations, PoseRequest
+from slrig.calibrate.store import SessionState
+from slrig.calibrate.verification import VerificationJob
+from slrig.calibration import PRINT_SIGMA, Board, BoardKind
 from slrig.errors import (
+    CalibrationError,
+    CalibrationNotFoundError,
+    CalibrationStateError,
     DeviceError,
     RigBusyError,
+    ScanCancelledError,
     ScanInterruptedError,
+    ScanStateError,
+    ScheduleError,
     ScheduleNotFoundError,
     SlrigError,
     UnsupportedByDeviceError,
     WorkerLostError,
 )
-from slrig.jobs.records import Clock, acting_as, utc_now
-from slrig.schedule.records import RunState, Schedule, ScheduledRun
-from slrig.schedule.store import ScheduleStore
+from slrig.failure import error_of, job_failure
+from slrig.jobs.manager import JobManager
+from slrig.jobs.records import Clock, Holder, JobState, acting_as, utc_now
+from slrig.jobs.store import JobStore
+from slrig.rig.session import RigFacts
+from slrig.schedule.store import RunState, Schedule, ScheduledRun, ScheduleSpec, ScheduleStore, TaskKind
 
 LOOK_S = 10.0
 """The clock is looked at this often at the least, so that one that is set anew is noticed."""
@@ -179,3 +199,428 @@ def _log_runs(runs: Iterable[ScheduledRun]) -> None:
     for run in runs:
         log = _log.info if run.state in {RunState.SUCCEEDED, RunState.COALESCED} else _log.warning
         log("scheduled run", schedule=str(run.schedule), due=run.due.isoformat(), state=run.state, cause=run.reason)
+
+
+ExposureSeconds = Annotated[float, Field(gt=0, le=60)]
+Position = Annotated[int, Field(ge=0, le=10_000)]
+
+
+class ScheduledBoard(Strict):
+    """The board, as POST /calibration has it."""
+
+    kind: Annotated[BoardKind, Field(strict=False)]
+    corners: Annotated[list[int], Field(min_length=2, max_length=2)]
+    square_mm: float
+    marker_mm: float | None = None
+    dictionary: str | None = None
+    square_sigma: Annotated[float, Field(gt=0, le=0.05)] | None = None
+    aspect: Annotated[float, Field(gt=0.9, lt=1.1)] = 1.0
+    measured_mm: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+
+    def board(self) -> Board:
+        """The board that is meant. Raises CalibrationError."""
+        columns, rows = self.corners
+        sigma = PRINT_SIGMA if self.square_sigma is None else self.square_sigma
+        board = Board(
+            self.kind, columns, rows, self.square_mm, self.marker_mm, self.dictionary, sigma, self.aspect
+        )  # fmt: skip
+        return (
+            board if self.measured_mm is None else board.as_measured(*self.measured_mm, square_sigma=self.square_sigma)
+        )
+
+
+class VerificationOptions(Strict):
+    """Of a verification. board None : that of the calibration in use. position None : the board stays where it is."""
+
+    board: ScheduledBoard | None = None
+    position: Position | None = None
+    exposure_s: ExposureSeconds | None = None
+
+
+class CalibrationOptions(Strict):
+    """Of a full set of poses with its solve. positions none : all of them. activate : have scans use what came of it,
+    unless its verdict leaves that to a person.
+    """
+
+    board: ScheduledBoard
+    positions: Annotated[list[Position | FreeText], Field(max_length=1000)] = Field(default_factory=list)
+    exposure_s: ExposureSeconds | None = None
+    activate: bool = False
+
+
+Options = TypeVar("Options", bound=Strict)
+
+
+def checked(model: type[Options], given: Mapping[str, Any], *, task: str) -> Options:
+    """The options of a task.
+
+    Raises
+    ------
+    ScheduleError
+        One is unknown or wrong: all faults in one message, and the options that there are.
+    """
+    try:
+        return model.model_validate(dict(given))
+    except ValidationError as error:
+        faults = "; ".join(line.strip() for line in describe_errors(error, dict(given), model_keys(model)).splitlines())
+        message = f"options: {faults}. The options of {task} are: {', '.join(model.model_fields)}"
+        raise ScheduleError(message) from error
+
+
+def require_positions(facts: RigFacts | None, asked: Sequence[int | str]) -> None:
+    """Refuse work that needs a positioner where the rig has none, or not those positions.
+
+    facts None : the rig is not open, and nobody knows; a run is refused then. asked : by number from 0 or by name.
+
+    Raises
+    ------
+    ScheduleError
+        No run could be done with this rig.
+    """
+    if facts is None:
+        return
+    names = facts.positions
+    if not names:
+        message = (
+            "this rig has no positioner, and nobody is there to move anything when a schedule is due: schedule a "
+            "verification of a board that stays in view, and calibrate or test by hand (slrig calibrate run, slrig "
+            "accept)"
+        )
+        raise ScheduleError(message)
+    missing = [each for each in asked if each not in names and each not in range(len(names))]
+    if missing:
+        message = (
+            f"options: this rig's positioner has no {', '.join(map(repr, missing))}; it has 0 to {len(names) - 1}: "
+            f"{', '.join(names)}"
+        )
+        raise ScheduleError(message)
+
+
+_TOLD = ("state", "reasons", "remedy", "expected_mm", "drift_mm", "scale_percent", "scale_mm")
+
+
+class Stop:
+    """Has a run of a schedule end early. Any thread may call."""
+
+    def __init__(self) -> None:
+        self._news = threading.Event()
+        self._asked = False
+
+    def ask(self) -> None:
+        """Have the run end."""
+        self._asked = True
+        self._news.set()
+
+    def wait(
+        self, jobs: JobStore, followed: UUID, reached: Callable[[], bool], *, cancel: Callable[[], object]
+    ) -> None:
+        """Return once `reached()`, which may turn true with each event of a job or of those of a group. Once the run is
+        to end, `cancel` is called, and ScanCancelledError is raised.
+        """
+        unwatch = jobs.watch(followed, self._news.set)
+        try:
+            while not reached():
+                if self._asked:
+                    cancel()
+                    message = "the run was cancelled"
+                    raise ScanCancelledError(message)
+                self._news.wait()
+                self._news.clear()
+        finally:
+            unwatch()
+
+
+class VerificationTask:
+    """The board shot where it is, or where the positioner takes it, and judged."""
+
+    options = VerificationOptions
+
+    def __init__(self, manager: JobManager, calibrations: Calibrations) -> None:
+        self._manager = manager
+        self._calibrations = calibrations
+
+    def check(self, asked: VerificationOptions, /) -> None:
+        """See `Task`. A calibration may be made before the first run; a board to look at is named now or never."""
+        self._board(asked)
+        if asked.position is not None:
+            require_positions(self._manager.rig.facts, [asked.position])
+
+    def do(self, holder: Holder, asked: VerificationOptions, /, *, stop: Stop) -> Mapping[str, Any]:
+        """See `Task`. A rig that is found stale is a verification that succeeded."""
+        manager, jobs = self._manager, self._manager.store
+        job = manager.submit(VerificationJob(self._board(asked), asked.position, asked.exposure_s), holder=holder)[0].id
+        stop.wait(jobs, job, lambda: jobs.get(job).state.final, cancel=lambda: manager.cancel(job))
+        over = jobs.get(job)
+        if over.fault is not None:
+            raise error_of(over.fault)
+        found = over.summary or {}
+        return {"verification": found["id"], **{name: found.get(name) for name in _TOLD}}
+
+    def _board(self, asked: VerificationOptions) -> Board:
+        """The board that is asked for, or that of the calibration in use."""
+        if asked.board is not None:
+            return asked.board.board()
+        active = self._calibrations.active
+        board = None if active is None else self._calibrations.register.get(active).board
+        if board is None:
+            used = "no calibration that was made here is in use" if active is None else "the one in use was imported"
+            message = (
+                f"which board is in view is not known: {used}. Give the schedule the option "
+                '"board", as {"kind": "charuco", "corners": [11, 8], "square_mm": 12}, or activate a calibration that '
+                "was made here"
+            )
+            raise CalibrationError(message)
+        return board
+
+
+class CalibrationTask:
+    """Every pose of the positioner shot, the solve, and, if asked for, its use. Scans may come between two poses; a
+    pose waits in line behind them.
+
+    tidy : called after each, however it ended, so that they do not pile up.
+    """
+
+    options = CalibrationOptions
+
+    def __init__(self, manager: JobManager, calibrations: Calibrations, tidy: Callable[[], object]) -> None:
+        self._manager = manager
+        self._calibrations = calibrations
+        self._tidy = tidy
+
+    def check(self, asked: CalibrationOptions, /) -> None:
+        """See `Task`."""
+        asked.board.board()
+        require_positions(self._manager.rig.facts, asked.positions)
+
+    def do(self, holder: Holder, asked: CalibrationOptions, /, *, stop: Stop) -> Mapping[str, Any]:
+        """See `Task`. Poses that are refused are left out; one that fails ends the run."""
+        facts = self._manager.rig.facts
+        require_positions(facts, asked.positions)
+        first, *others = asked.positions or range(0 if facts is None else len(facts.positions))
+        session = self._calibrations.open(asked.board.board(), label=holder.words).id
+        try:
+            try:
+                # The first may not wait: a busy rig is told before anything was done.
+                self._shoot(session, holder, PoseRequest(first, asked.exposure_s), wait=False)
+            except BaseException:
+                self._calibrations.delete(session)
+                raise
+            for position in others:
+                # Until the last pose was shot: it may still be read while the next one is.
+                self._await_poses(session, {JobState.QUEUED, JobState.CAPTURING}, stop)
+                self._shoot(session, holder, PoseRequest(position, asked.exposure_s), wait=True)
+            self._await_poses(session, {JobState.QUEUED, JobState.CAPTURING, JobState.COMPUTING}, stop)
+            return self._solved(session, asked, stop)
+        except (DeviceError, WorkerLostError):
+            # It is tried again from the first pose on. A pose that is being read yet leaves it to `tidy`.
+            with suppress(CalibrationStateError, CalibrationNotFoundError):
+                self._calibrations.delete(session)
+            raise
+        finally:
+            self._tidy()
+
+    def _shoot(self, session: UUID, holder: Holder, request: PoseRequest, *, wait: bool) -> None:
+        self._calibrations.shoot(session, request, wait=wait, holder=holder)
+
+    def _await_poses(self, session: UUID, pending: set[JobState], stop: Stop) -> None:
+        register = self._calibrations.register
+
+        def cancel() -> None:
+            for pose in register.get(session).poses:
+                self._calibrations.cancel(session, pose.number)
+
+        def shot() -> bool:
+            return not any(pose.state in pending for pose in register.get(session).poses)
+
+        stop.wait(self._manager.store, session, shot, cancel=cancel)
+        for pose in register.get(session).poses:
+            if pose.fault is not None and not pose.refused:
+                raise error_of(pose.fault)
+
+    def _solved(self, session: UUID, asked: CalibrationOptions, stop: Stop) -> Mapping[str, Any]:
+        register = self._calibrations.register
+        self._calibrations.solve(session)
+
+        def solved() -> bool:
+            return register.get(session).state is not SessionState.SOLVING
+
+        stop.wait(self._manager.store, session, solved, cancel=lambda: None)
+        record = register.get(session)
+        if record.fault is not None:
+            raise error_of(record.fault)
+        result = record.result or {}
+        verdict = result.get("verdict") or {}
+        # Nobody looks at the report before scans use it.
+        unattended = verdict.get("unattended") or []
+        activated = asked.activate and not unattended
+        if activated:
+            self._calibrations.activate(session)
+        return {
+            "calibration": str(session),
+            "poses": len(record.poses),
+            "accepted": len(record.accepted),
+            "refused": {
+                pose.position_name or pose.name: pose.fault.message
+                for pose in record.poses
+                if pose.refused and pose.fault is not None
+            },
+            "verdict": verdict.get("summary"),
+            "expected_error_mm": (result.get("expected") or {}).get("point_mm"),
+            "activated": activated,
+            "left_to_a_person": unattended if asked.activate else [],
+        }
+
+
+class AcceptanceTask:
+    """Every prescribed position measured by the rig's positioner, and the decision."""
+
+    options = AcceptanceRequest
+
+    def __init__(self, manager: JobManager, tests: AcceptanceTests) -> None:
+        self._manager = manager
+        self._tests = tests
+
+    def check(self, _asked: AcceptanceRequest, /) -> None:
+        """See `Task`."""
+        require_positions(self._manager.rig.facts, ())
+
+    def do(self, holder: Holder, asked: AcceptanceRequest, /, *, stop: Stop) -> Mapping[str, Any]:
+        """See `Task`. A rig that fails the test is a run that succeeded."""
+        tests = self._tests
+        test = tests.open(asked.plan).id
+        try:
+            tests.measure(test, wait=False, scripted=True, holder=holder)
+        except BaseException:
+            tests.cancel(test)
+            raise
+
+        def measured() -> bool:
+            return tests.get(test).state is not AcceptanceState.MEASURING
+
+        stop.wait(self._manager.store, test, measured, cancel=lambda: tests.cancel(test))
+        record = tests.get(test)
+        if record.decision is None:
+            tests.cancel(test)
+            raise error_of(record.fault or job_failure(RuntimeError("the test ended without a result")))
+        return {
+            "acceptance": str(test),
+            "decision": str(record.decision),
+            "quantities": {
+                str(each.quantity): {
+                    "error_mm": each.error_mm,
+                    "limit_mm": each.limit_mm,
+                    "uncertainty_mm": each.uncertainty.expanded_mm,
+                    "position": each.step,
+                    "decision": str(each.decision),
+                }
+                for each in verdicts(record.readings, record.plan)
+            },
+        }
+
+
+class ScheduledTask(Protocol):
+    """One kind of work. options : what may be said of it; both methods are given one of these."""
+
+    @property
+    def options(self) -> type[Strict]: ...  # noqa: D102 - see above
+
+    def check(self, asked: Any, /) -> None:
+        """Raise ScheduleError or CalibrationError for options that no run could be done with, as far as is known."""
+        ...
+
+    def do(self, holder: Holder, asked: Any, /, *, stop: Stop) -> Mapping[str, Any]:
+        """Do it, the rig held by `holder`, and return what is on record of it, as JSON values.
+
+        Raises
+        ------
+        RigBusyError
+            Somebody holds the rig: before anything was done.
+        SlrigError
+            It could not be done.
+        """
+        ...
+
+
+class Tasks:
+    """Every kind of work: a `slrig.schedule.scheduler.Work`. Any thread may call.
+
+    tidy : called after each calibration, see `slrig.calibrate.job`.
+    """
+
+    def __init__(
+        self,
+        manager: JobManager,
+        calibrations: Calibrations,
+        acceptance: AcceptanceTests,
+        *,
+        tidy: Callable[[], object] = lambda: None,
+    ) -> None:
+        self._manager = manager
+        self._of: Mapping[TaskKind, ScheduledTask] = {
+            TaskKind.VERIFICATION: VerificationTask(manager, calibrations),
+            TaskKind.CALIBRATION: CalibrationTask(manager, calibrations, tidy),
+            TaskKind.ACCEPTANCE: AcceptanceTask(manager, acceptance),
+        }
+        self._lock = threading.Lock()
+        self._ended = False
+        self._stops: dict[UUID, Stop] = {}
+
+    def check(self, order: ScheduleSpec) -> None:
+        """Raise ScheduleError, with every fault, for options that no run could be done with."""
+        task = self._of[order.task]
+        try:
+            task.check(checked(task.options, order.options, task=order.task))
+        except CalibrationError as error:
+            message = f"options: {error}"
+            raise ScheduleError(message) from error
+
+    def __call__(self, schedule: Schedule, run: ScheduledRun, /) -> Mapping[str, Any]:
+        """See `slrig.schedule.scheduler.Work`."""
+        order, stop = schedule.order, Stop()
+        task, holder = self._of[order.task], holder_of(schedule, run)
+        with self._lock:
+            self._stops[schedule.id] = stop
+            if self._ended:
+                stop.ask()
+        try:
+            if self._manager.rig.facts is None:
+                # What it can do is known only when it is open.
+                self._manager.lend(holder, lambda _rig, _cancelled: None)
+            return task.do(holder, checked(task.options, order.options, task=order.task), stop=stop)
+        finally:
+            with self._lock:
+                self._stops.pop(schedule.id, None)
+
+    def end(self) -> None:
+        """Have every run end: the service ends."""
+        with self._lock:
+            self._ended = True
+            stops = list(self._stops.values())
+        for stop in stops:
+            stop.ask()
+
+    def cancel(self, schedule: Schedule) -> None:
+        """Ask the run of a schedule that is under way to end early. Returns at once. Raises ScanStateError."""
+        with self._lock:
+            stop = self._stops.get(schedule.id)
+        if stop is None:
+            message = f"Schedule {schedule.id} has no run under way. GET /schedule/{schedule.id}/runs lists its runs."
+            raise ScanStateError(message)
+        stop.ask()
+
+
+def holder_of(schedule: Schedule, run: ScheduledRun) -> Holder:
+    """Who holds the rig for a run.
+
+    >>> from datetime import UTC, datetime
+    >>> from slrig.schedule.store import Cron, RunState, ScheduleSpec
+    >>> due = datetime(2026, 11, 23, 5, 30, tzinfo=UTC)
+    >>> order = ScheduleSpec(Cron("30 6 * * *", "Europe/Berlin"), TaskKind.VERIFICATION)
+    >>> schedule = Schedule(UUID(int=7), order, due, due)
+    >>> run = ScheduledRun(1, schedule.id, due, RunState.RUNNING, None, 1, 1, due, None, None, None, None)
+    >>> holder_of(schedule, run).name
+    'schedule 00000000, verification due 06:30'
+    """
+    due = schedule.order.cron.local(run.due)
+    words = f"schedule {str(schedule.id)[:8]}, {schedule.order.task} due {due:%H:%M}"
+    return Holder(words, words, f"/schedule/{schedule.id}")

@@ -34,8 +34,7 @@ from slrig.model import (
     White,
 )
 from slrig.patterns import encode, gray_bits
-from slrig.scan.plan import PatternPlan
-from slrig.scan.plan_check import pattern_sequence
+from slrig.scan.plan import PatternPlan, pattern_sequence
 from tests.bench.line_sweep import scenes
 from tests.contract.pairing import Truths
 from tests.golden.lit_scenes import LitScene

@@ -21,8 +21,7 @@ from simulated_rig.scene import Scene, read_scene
 from slrig.errors import NothingToReconstructError
 from slrig.model import Gray, LineShift, Pattern, SequenceName, Size
 from slrig.patterns.sequence import scan_patterns
-from slrig.scan.plan import PatternPlan
-from slrig.scan.plan_check import pattern_sequence
+from slrig.scan.plan import PatternPlan, pattern_sequence
 from tests.golden.lit_scenes import SCENES, Figures, Light, LitScene
 
 POSTS = Scene.model_validate(

@@ -27,11 +27,8 @@ from slrig.discovery import open_rig
 from slrig.errors import NothingToReconstructError, ScanEvidenceError
 from slrig.model import SequenceName
 from slrig.scan.acquisition import capture_frames
-from slrig.scan.exposure_look import Looking
-from slrig.scan.exposure_proposal import Proposal, proposal
-from slrig.scan.plan import PatternPlan, ScanPlan
-from slrig.scan.plan_check import pattern_sequence
-from slrig.scan.presets import SHIPPED
+from slrig.scan.exposure import Looking, Proposal, proposal
+from slrig.scan.plan import SHIPPED, PatternPlan, ScanPlan, pattern_sequence
 from tests.golden.shipped_rigs import PAINT, SMALL, rig_file
 from tests.golden.test_bundles import reconstructed
 

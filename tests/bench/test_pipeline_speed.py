@@ -28,14 +28,13 @@ from slrig.discovery import open_rig
 from slrig.model import Calibration, Mesh, Region
 from slrig.model.capture import CaptureHeader
 from slrig.scan.acquisition import capture_frames
-from slrig.scan.axis_agreement import AxisAgreement
+from slrig.scan.agreement import AxisAgreement
 from slrig.scan.losses import code_of
-from slrig.scan.measured import Walked
+from slrig.scan.measured import Walked, triangulate_cameras
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import _meshed
 from slrig.scan.report import Stopwatch
 from slrig.scan.stream import ScanStream, cell_px, step_px
-from slrig.scan.triangulated import triangulate_cameras
 
 RUNS = 5
 WHOLE = ReconstructionPlan()

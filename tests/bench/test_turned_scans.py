@@ -22,10 +22,10 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from slrig.combine.combining import read_mesh
 from slrig.meshing.quality import SearchTree
 from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray, Mesh
+from slrig.model_jobs.combining import read_mesh
 from tests.turned_views import displacement_mm
 from tests.unit.multiview.known_views import flange, plate_on_box, relief, star, vase
 

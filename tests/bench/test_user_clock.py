@@ -24,7 +24,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from slrig.client import Client
-from slrig.client.events import Captured, FileReady, Progress, StateChange
+from slrig.client.connection import Captured, FileReady, Progress, StateChange
 from slrig.scan.plan import ScanPlan
 from tests.bench.test_pipeline_speed import RIG
 from tests.bench.test_whole_commands import rendered, told

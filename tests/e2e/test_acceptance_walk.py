@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from slrig.accept.asking import AcceptanceRequest
-from slrig.accept.scene import SCENE, scripted_config
+from slrig.accept.job import SCENE, scripted_config
+from slrig.accept.plan import AcceptanceRequest
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from tests.e2e.conftest import SLOW, Start, write_rig

@@ -41,8 +41,7 @@ from slrig.discovery import open_rig
 from slrig.meshing.quality import SearchTree, TruthScore, score
 from slrig.model import Calibration, CameraFormat, Mesh, Pixels, Size, Truth
 from slrig.scan.acquisition import capture_frames
-from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
-from slrig.scan.plan_check import pattern_sequence
+from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan, pattern_sequence
 from slrig.scan.reconstruct import reconstruct_bundle
 from tests.contract.screen_bench import let_go
 from tests.contract.screen_server import DummyServer, OutputPixels, require_xorg

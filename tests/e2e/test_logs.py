@@ -24,7 +24,7 @@ import structlog
 from slrig import KEY_VARIABLE
 from slrig.api import server
 from slrig.config import ServiceSettings, parse_rig
-from slrig.jobs import worker_process
+from slrig.jobs import worker as worker_process
 from slrig.jobs.worker import Worker
 from tests.e2e.conftest import Start, ended
 from tests.unit.api.conftest import ServedBench

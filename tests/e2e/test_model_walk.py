@@ -14,11 +14,11 @@ import pytest
 from slrig.bundle.options import read_poses
 from slrig.client import Client
 from slrig.client.errors import ConflictError, ModelFailedError
-from slrig.combine.offered import MEDIA_TYPES
 from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, utc_now, write_record
+from slrig.model_jobs.plan import MEDIA_TYPES
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply
+from slrig.scan.job import plan_json
 from slrig.scan.plan import ScanPlan
-from slrig.scan.records import plan_json
 from tests.e2e.conftest import Start, write_rig
 from tests.turned_views import AXIS, AXIS_POINT_MM, bumpy, displacement_mm, off_surface_mm, seen
 

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.replay import open_head
 from slrig.bundle import read_capture
-from slrig.calibrate.records import USUAL_PATTERNS
+from slrig.calibrate.store import USUAL_PATTERNS
 from slrig.config import read_rig
 from slrig.devices import CameraSettings, Rig
 from slrig.discovery import open_rig

@@ -15,9 +15,8 @@ from slrig.config import NoticeKind, ServiceSettings, read_settings
 from slrig.errors import ConfigError
 from slrig.extras.mqtt import Broker
 from slrig.jobs.database import Database
-from slrig.jobs.outbox import Outbox
-from slrig.schedule.receivers import senders_of, wanted_kinds
-from slrig.schedule.sending import Sender
+from slrig.jobs.store import Outbox
+from slrig.schedule.notices import Sender, senders_of, wanted_kinds
 from tests.unit.schedule.receivers import LOGIN, Mosquitto, own_certificate
 from tests.unit.schedule.test_senders import Bench
 

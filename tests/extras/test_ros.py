@@ -11,7 +11,7 @@ import pytest
 from slrig.extras.ros import device_of, encode_bag
 from slrig.model import Calibration, Pinhole, Size
 from slrig.ros_messages import Messages, pose
-from slrig.scan.organised import OrganisedCloud
+from slrig.scan.clouds import OrganisedCloud
 from tests.ros_readers import colours, library, point_columns, seen_at
 from tests.unit.scan.test_organised import BARREL, SIZE, camera
 

@@ -22,8 +22,7 @@ from slrig.bundle import write_bundle, write_truth
 from slrig.model import Calibration, CameraFormat, Capture, Pattern, Pixels, Shot, Surface, Truth
 from slrig.patterns.sequence import profile
 from slrig.scan.artefacts import decode_mesh_ply
-from slrig.scan.plan import PatternPlan
-from slrig.scan.plan_check import pattern_sequence
+from slrig.scan.plan import PatternPlan, pattern_sequence
 from tests.golden.test_bundles import reconstructed
 from tests.light_bound import ExposedView
 

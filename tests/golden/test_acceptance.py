@@ -9,16 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slrig.accept.plan import AcceptancePlan, Quantity, exact_artefacts
-from slrig.accept.positions import acceptance_plan, rig_volume_mm
-from slrig.accept.running import run_acceptance
-from slrig.accept.scene import scripted_config
+from slrig.accept.evaluation import AcceptanceResult
+from slrig.accept.job import PositionJob, scripted_config
+from slrig.accept.plan import AcceptancePlan, Quantity, acceptance_plan, exact_artefacts, rig_volume_mm
 from slrig.accept.store import points_file
-from slrig.accept.verdicts import AcceptanceResult
 from slrig.calibration.artefacts import Decision, fit_sphere
-from slrig.config import read_rig
+from slrig.cli import local
+from slrig.cli.accept import measure_positions
+from slrig.config import RigConfig, read_rig
+from slrig.devices import Rig
 from slrig.discovery import open_rig
 from slrig.errors import NothingToReconstructError
+from slrig.jobs.records import Holder
 from slrig.model import Calibration
 
 pytestmark = pytest.mark.slow
@@ -40,11 +42,27 @@ def plan_of(*names: str) -> tuple[AcceptancePlan, Calibration]:
     return replace(plan, steps=steps), calibration
 
 
-def outcome(plan: AcceptancePlan, folder: Path, *, calibration: Calibration | None = None) -> AcceptanceResult:
-    """Run the plan, by another calibration than the rig's exact one where one is given."""
-    with open_rig(scripted_config(read_rig(RIG), plan, folder / "scene")) as rig:
-        used = rig if calibration is None else replace(rig, calibration=calibration)
-        return run_acceptance(used, plan, folder / "out", progress=lambda *_: None, cancelled=lambda: False)
+def outcome(
+    plan: AcceptancePlan,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    calibration: Calibration | None = None,
+    wrong: AcceptancePlan | None = None,
+) -> AcceptanceResult:
+    """Run the plan on a scene of its artefacts, by another calibration than the rig's exact one where one is given.
+    wrong : the plan in place of that of the scene.
+    """
+
+    def opened(config: RigConfig) -> Rig:
+        rig = open_rig(config)
+        return rig if calibration is None else replace(rig, calibration=calibration)
+
+    monkeypatch.setattr(local, "open_rig", opened)
+    config = scripted_config(read_rig(RIG), plan, folder / "scene")
+    with local.local_manager(config, PositionJob) as manager:
+        manager.lend(Holder("test", "test", None), lambda rig, _: rig.open())
+        return measure_positions(manager, wrong or plan, folder / "out", progress=lambda *_: None)
 
 
 def scaled(calibration: Calibration, scale: float) -> Calibration:
@@ -58,10 +76,10 @@ def scaled(calibration: Calibration, scale: float) -> Calibration:
     return Calibration(cameras, projector)
 
 
-def test_the_error_of_a_wrong_scale_is_found(tmp_path: Path) -> None:
+def test_the_error_of_a_wrong_scale_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scale = 1.002
     plan, calibration = plan_of("sphere-1", "bar-1")
-    result = outcome(plan, tmp_path, calibration=scaled(calibration, scale))
+    result = outcome(plan, tmp_path, monkeypatch, calibration=scaled(calibration, scale))
     found = {verdict.quantity: verdict for verdict in result.verdicts}
     expected = (scale - 1) * plan.artefacts.distance.value_mm
     assert found[Quantity.SPACING].error_mm == pytest.approx(expected, abs=plan.diagonal_mm / 20_000)
@@ -70,19 +88,21 @@ def test_the_error_of_a_wrong_scale_is_found(tmp_path: Path) -> None:
     assert found[Quantity.FORM].error_mm < FORM_SIGMAS * result.readings[0].noise_mm
 
 
-def test_a_position_without_its_artefact_is_refused(tmp_path: Path) -> None:
+def test_a_position_without_its_artefact_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan, _ = plan_of("sphere-1")
     larger = replace(plan.artefacts, diameter=replace(plan.artefacts.diameter, value_mm=25.0))
     # The scene has the sphere of the plan, the test is told of a larger one.
-    scene, wrong = scripted_config(read_rig(RIG), plan, tmp_path / "scene"), replace(plan, artefacts=larger)
-    with open_rig(scene) as rig, pytest.raises(NothingToReconstructError, match="sphere-1: expected 1 ball of 25 mm"):
-        run_acceptance(rig, wrong, tmp_path / "out", progress=lambda *_: None, cancelled=lambda: False)
+    wrong = replace(plan, artefacts=larger)
+    with pytest.raises(NothingToReconstructError, match="sphere-1: expected 1 ball of 25 mm"):
+        outcome(plan, tmp_path, monkeypatch, wrong=wrong)
     assert not (tmp_path / "out" / "report.json").exists()
 
 
-def test_the_whole_test_of_a_rendered_rig_reports_the_errors_that_there_are(tmp_path: Path) -> None:
+def test_the_whole_test_of_a_rendered_rig_reports_the_errors_that_there_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plan, _ = plan_of()
-    result = outcome(plan, tmp_path)
+    result = outcome(plan, tmp_path, monkeypatch)
     assert result.complete
     assert len(result.readings) == 23
     spacing = next(each for each in result.verdicts if each.quantity is Quantity.SPACING)

@@ -27,8 +27,8 @@ from slrig.cli.commands import app
 from slrig.errors import CalibrationError
 from slrig.model import AlbedoMark, Black, Capture, FloatArray, LightMap, Primary, SequenceName, White
 from slrig.scan.artefacts import decode_mesh_ply
-from slrig.scan.light_board import with_light_map
 from slrig.scan.plan import PatternPlan, ScanPlan
+from slrig.scan.reconstruct import with_light_map
 from tests.golden.shipped_rigs import GRAINY, SMALL, replaced, rig_file
 from tests.golden.test_bracketing import captured
 from tests.golden.test_bundles import reconstructed

@@ -16,9 +16,8 @@ from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
 from slrig.bundle.calibration import write_calibration
-from slrig.calibrate.pose_frames import bundle_device_sizes
-from slrig.calibrate.pose_reading import read_pose
-from slrig.calibrate.solving import CalibrationResult, ReadPose, solve_poses
+from slrig.calibrate.pose_reading import bundle_device_sizes, read_pose
+from slrig.calibrate.store import CalibrationResult, ReadPose, solve_poses
 from slrig.calibration.board import COLUMN, ROW, Board, BoardKind, Correspondences
 from slrig.calibration.solution import PARAMETERS, PROJECTOR
 from slrig.cli.commands import app

@@ -15,7 +15,7 @@ import pytest
 
 from slrig.bundle import Bundle, read_bundle
 from slrig.calibrate.pose_reading import read_pose
-from slrig.calibrate.solving import solve_poses
+from slrig.calibrate.store import solve_poses
 from slrig.calibrate.verification import verify_bundle
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.health import HealthState, judge_health

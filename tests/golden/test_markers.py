@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from slrig.bundle.options import TurntableRecord, encode_turntable, read_poses
 from slrig.cli.commands import app
-from slrig.combine.combining import read_mesh
 from slrig.model import PlaneKind, TurntablePlane
+from slrig.model_jobs.combining import read_mesh
 from slrig.multiview.turntable import cut_view, turntable_poses
 from tests.golden.test_turntable import AXIS as STAGE_AXIS
 from tests.golden.test_turntable import VASE, scanned

@@ -24,8 +24,8 @@ from slrig.bundle.description import read_description
 from slrig.bundle.reading import read_bundle
 from slrig.model import FloatArray, Pinhole, Refusal, White
 from slrig.scan.artefacts import decode_mesh_ply, write_converted
-from slrig.scan.cloud_files import cloud_file
-from slrig.scan.offered import requested_forms
+from slrig.scan.clouds import cloud_file
+from slrig.scan.formats import requested_forms
 from tests.golden.conftest import Scan
 from tests.ros_readers import colours, library, point_columns, seen_at
 

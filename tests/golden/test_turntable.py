@@ -15,9 +15,9 @@ from simulated_rig.device import open_simulated_head
 from slrig.bundle import write_calibration
 from slrig.bundle.options import read_turntable
 from slrig.cli.commands import app
-from slrig.combine.combining import read_mesh
 from slrig.devices import CameraSettings, Rig, Turntable
 from slrig.model import PlaneKind, RotationAxis
+from slrig.model_jobs.combining import read_mesh
 from slrig.multiview.registration import register_views
 from slrig.multiview.turntable import cut_view, find_turntable_planes, turntable_poses
 from slrig.scan.acquisition import capture_frames

@@ -17,7 +17,7 @@ from slrig.bundle import read_bundle
 from slrig.meshing.rasteriser import rasterise
 from slrig.model import Axis
 from slrig.reconstruction.frames import axis_frames
-from slrig.scan.placing import placed_vertices
+from slrig.scan.pictures import placed_vertices
 from slrig.scan.plan import PatternPlan, ReconstructionPlan
 from tests.golden.test_bundles import reconstructed
 from tests.golden.test_light_axis import Device, rig_file, scanned

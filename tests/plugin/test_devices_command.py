@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from slrig.cli import devices
+from slrig.cli import rig_file as devices
 from slrig.cli.commands import app
 from slrig.devices import FoundDevice
 from slrig.discovery import DiscoveredDevices, InstalledDriver, MissingLibrary

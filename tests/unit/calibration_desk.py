@@ -7,8 +7,8 @@ from typing import Any
 
 import httpx2
 
-from slrig.api.calibration_schemas import CalibrationBody, CalibrationList, PoseBody
-from slrig.calibrate.pose_judging import summary
+from slrig.api.calibration import CalibrationBody, CalibrationList, PoseBody
+from slrig.calibrate.report import summary
 from slrig.client import Client
 from tests.unit.calibrate.solved import BOARD, solved_result
 

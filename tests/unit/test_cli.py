@@ -24,29 +24,35 @@ import pytest
 import typer
 from rich.console import Console
 
+from slrig.accept.evaluation import AcceptanceResult
+from slrig.accept.job import scripted_config
 from slrig.accept.plan import AcceptancePlan, Limits
-from slrig.accept.running import run_acceptance
-from slrig.accept.scene import scripted_config
-from slrig.accept.verdicts import AcceptanceResult
 from slrig.api.schemas import ScanRequest
 from slrig.bundle.options import read_region
 from slrig.calibration.artefacts import Decision
 from slrig.cli import accept as accepting
-from slrig.cli.accept import moving, placed_by_hand, plan_for
+from slrig.cli.accept import measure_positions, moving, placed_by_hand, plan_for
 from slrig.cli.commands import INTERRUPTED, app
-from slrig.cli.demo import remove_earlier, require_sound, still_missing
 from slrig.cli.display import ProgressDisplay, print_json, print_table
 from slrig.cli.options import AcceptanceOptions, ServiceOptions
-from slrig.cli.quality import quality_lines
-from slrig.cli.scan import scan_with, series_with, tell_result
+from slrig.cli.scan import (
+    quality_lines,
+    remove_earlier,
+    require_sound,
+    scan_with,
+    series_with,
+    still_missing,
+    tell_result,
+)
 from slrig.client import Client, ScanJob
 from slrig.config import read_rig
 from slrig.devices import Rig
 from slrig.discovery import open_rig
 from slrig.errors import InvalidInputError, ScanCancelledError, ServiceError, SlrigError, UnsupportedByDeviceError
+from slrig.jobs.manager import JobManager
 from slrig.model import Region
-from slrig.scan.offered import MEDIA_TYPES
-from slrig.scan.records import report_summary
+from slrig.scan.formats import MEDIA_TYPES
+from slrig.scan.job import report_summary
 from slrig.scan.report import sigma_words
 from tests.unit.capture.fake_rig import fake_rig
 from tests.unit.client.service import SCAN, Walk, client_of, failing
@@ -159,7 +165,7 @@ def test_interruption_is_exit_code_130(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(**_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("slrig.cli.devices.list_devices", interrupted)
+    monkeypatch.setattr("slrig.cli.rig_file.list_devices", interrupted)
     assert slrig("devices").exit_code == INTERRUPTED
 
 
@@ -575,13 +581,12 @@ def test_person_reads_each_position_and_may_leave(plan: AcceptancePlan) -> None:
         return answer
 
     place = placed_by_hand(plan, Console(file=shown, width=120), ask=ask)
-    rig = Rig("tame", {}, None, {})  # type: ignore[arg-type]
-    place(rig, plan.steps[0])
+    place(plan.steps[0])
     assert "1 of 23" in shown.getvalue()
     assert "Put the sphere in the middle of the volume." in shown.getvalue()
     for _ in ("q", "end of input"):
         with pytest.raises(ScanCancelledError, match="left before sphere-2"):
-            place(rig, plan.steps[1])
+            place(plan.steps[1])
 
 
 @pytest.mark.slow
@@ -589,14 +594,14 @@ def test_person_reads_each_position_and_may_leave(plan: AcceptancePlan) -> None:
 def test_the_command_does_the_test_and_returns_the_decision(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *, as_json: bool
 ) -> None:
-    whole, limits_mm = run_acceptance, list[float]()
+    whole, limits_mm = measure_positions, list[float]()
 
-    def shortened(rig: Rig, plan: AcceptancePlan, folder: Path, **options: object) -> AcceptanceResult:
+    def shortened(manager: JobManager, plan: AcceptancePlan, folder: Path, **options: Any) -> AcceptanceResult:
         limits_mm.append(plan.limits.spacing_mm)
         steps = tuple(step for step in plan.steps if step.name == "bar-5")
-        return whole(rig, replace(plan, steps=steps, repeats=1), folder, **options)  # type: ignore[arg-type]
+        return whole(manager, replace(plan, steps=steps, repeats=1), folder, **options)
 
-    monkeypatch.setattr(accepting, "run_acceptance", shortened)
+    monkeypatch.setattr(accepting, "measure_positions", shortened)
     output, rig_file = tmp_path / "out", tmp_path / "rig.toml"
     text = BALL_BAR.read_text(encoding="utf-8").replace('"../', f'"{RIGS.parent}/')
     rig_file.write_text(f"{text}\n[accuracy]\ntolerance_mm = 0.04\n", encoding="utf-8")

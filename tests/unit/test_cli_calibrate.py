@@ -14,12 +14,11 @@ import pytest
 from rich.console import Console
 from typer.testing import Result
 
-from slrig.api.calibration_schemas import ComparisonBody
+from slrig.api.calibration import ComparisonBody
 from slrig.bundle import read_calibration, read_opencv_calibration, write_calibration, write_opencv_calibration
-from slrig.calibrate.pose_judging import summary
+from slrig.calibrate.report import summary
 from slrig.calibration.board import DEFAULT_BOARD, BoardShape
-from slrig.cli.calibrate_walk import Walk, opened
-from slrig.cli.calibration_screen import tell_result
+from slrig.cli.calibrate_walk import Walk, opened, tell_result
 from slrig.cli.commands import INTERRUPTED
 from slrig.cli.options import ServiceOptions
 from slrig.client import Client
@@ -92,10 +91,8 @@ class Solving:
 def solving(monkeypatch: pytest.MonkeyPatch) -> Solving:
     made = Solving()
     monkeypatch.setattr("slrig.calibrate.pose_reading.read_pose", made.read_pose)
-    monkeypatch.setattr("slrig.calibrate.solving.solve_poses", made.solve_poses)
-    monkeypatch.setattr(
-        "slrig.calibrate.pose_pictures.white_frame", lambda *_: np.full((1024, 1280), 80, dtype=np.uint8)
-    )
+    monkeypatch.setattr("slrig.calibrate.store.solve_poses", made.solve_poses)
+    monkeypatch.setattr("slrig.calibrate.report.white_frame", lambda *_: np.full((1024, 1280), 80, dtype=np.uint8))
     return made
 
 

@@ -12,9 +12,8 @@ from typing import Annotated, Any, Literal
 import pytest
 from pydantic import BaseModel, Field
 
-from slrig.cli import init
-from slrig.cli.driver_options import Option, sections
-from slrig.cli.init import failure_of, typed
+from slrig.cli import rig_file as init
+from slrig.cli.rig_file import Option, failure_of, sections, typed
 from slrig.cli.rig_schema import rig_schema
 from slrig.config import RigConfig, read_rig
 from slrig.devices import Camera, FoundDevice, Projector

@@ -24,12 +24,12 @@ from slrig.bundle.options import (
 )
 from slrig.bundle.sidecars import TurntableAngle, write_turntable_angle
 from slrig.cli import model_shoot
-from slrig.client.events import Progress
-from slrig.combine import plan
-from slrig.combine.turntable import with_axis
+from slrig.client.connection import Progress
 from slrig.devices import Rig
 from slrig.errors import ConfigError, DeviceGoneError, ServiceError
 from slrig.model import MeasuredAxis, PlaneKind, TurntablePlane
+from slrig.model_jobs import plan
+from slrig.model_jobs.turntable import with_axis
 from slrig.multiview import registration
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply
 from slrig.scan.plan import ScanPlan

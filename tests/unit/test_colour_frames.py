@@ -35,8 +35,7 @@ from slrig.model import (
 from slrig.model.capture import CaptureHeader
 from slrig.patterns.sequence import encode
 from slrig.reconstruction.fusion import FusedFrames, fuse_colour
-from slrig.scan.plan import ScanPlan
-from slrig.scan.plan_check import in_colour
+from slrig.scan.plan import ScanPlan, in_colour
 from slrig.scan.stream import CameraResult, ScanStream
 from tests.samples import CAMERA, noise, sample_calibration, sample_capture
 from tests.unit.capture.fake_rig import CameraFaults, FakeRig, fake_rig

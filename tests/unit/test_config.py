@@ -11,7 +11,7 @@ import pytest
 
 from drivers.serial_projector.device import main as box
 from slrig.bundle.options import ScanDefaults
-from slrig.cli.init import failure_of
+from slrig.cli.rig_file import failure_of
 from slrig.config import RigConfig, is_loopback, read_rig, read_settings
 from slrig.discovery import drivers_with_options
 from slrig.errors import ConfigError

@@ -10,8 +10,8 @@ import pytest
 from slrig import plugins
 from slrig.config import ServiceSettings
 from slrig.errors import ConfigError
-from slrig.scan.offered import camera_prefixes, missing_for, on_demand, requested_forms
-from slrig.schedule.receivers import wanted_kinds
+from slrig.scan.formats import camera_prefixes, missing_for, on_demand, requested_forms
+from slrig.schedule.notices import wanted_kinds
 
 
 @pytest.fixture

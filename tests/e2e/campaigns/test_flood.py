@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from slrig.api.connections import KEPT_DESCRIPTORS, WANTED_DESCRIPTORS
+from slrig.api.server import KEPT_DESCRIPTORS, WANTED_DESCRIPTORS
 from tests.e2e.conftest import KEY, SLOW, ServiceProcess, Start, ended, followed_to, write_rig
 
 pytestmark = pytest.mark.slow

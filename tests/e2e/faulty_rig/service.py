@@ -19,7 +19,7 @@ from typing import Any, Self
 
 from slrig.bundle import write_calibration
 from slrig.client import Client
-from slrig.client.events import StateChange
+from slrig.client.connection import StateChange
 from slrig.errors import ServiceError
 from tests.e2e.conftest import KEY, ServiceProcess
 from tests.e2e.faulty_rig.driver import CAMERA_NAME, calibration

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from slrig.api.keys import KeyRing
-from slrig.api.scopes import Scope
+from slrig.api.auth import KeyRing
+from slrig.api.scopes import KeyScope
 from slrig.config import ServiceSettings
 from tests.e2e.conftest import KEY, ServiceProcess
 from tests.npm import npm_package
@@ -87,7 +87,7 @@ def fits(page: Page) -> None:
 
 
 def looking(service: ServiceProcess) -> str:
-    return KeyRing(ServiceSettings(data_dir=service.data).key_path).add("Ann", [Scope.LOOK])
+    return KeyRing(ServiceSettings(data_dir=service.data).key_path).add("Ann", [KeyScope.LOOK])
 
 
 def count(found: Locator, number: int) -> None:

@@ -12,17 +12,16 @@ import numpy as np
 import pytest
 from sqlalchemy import update
 
-from slrig.api.keys import KeyRing
-from slrig.api.scopes import Scope
-from slrig.catalogue.store import Catalogue, open_catalogue
-from slrig.catalogue.tables import RigRow
+from slrig.api.auth import KeyRing
+from slrig.api.scopes import KeyScope
+from slrig.catalogue.store import Catalogue, RigRow, open_catalogue
 from slrig.config import ServiceSettings
 from slrig.conformance import CheckOutcome, ConformanceReport
 from slrig.conformance.bench import Failure
 from slrig.conformance.running import CheckResult
+from slrig.doctor import keep
 from slrig.doctor.doctor import Diagnosis
 from slrig.doctor.light import fault, ok
-from slrig.jobs.examinations import keep
 from slrig.jobs.records import utc_now
 from tests.e2e.conftest import KEY, SLOW, Start, write_rig
 from tests.e2e.page.conftest import PHONE, Visit, count, disabled, fits, looking, violations
@@ -286,7 +285,7 @@ def test_a_camera_is_unplugged_and_a_key_expires(start: Start, tmp_path: Path, v
 
     # The form, and back to the screen.
     keys = ServiceSettings(data_dir=service.data).key_path
-    secret = KeyRing(keys).add("Ann", [Scope.SCAN], life=timedelta(hours=1))
+    secret = KeyRing(keys).add("Ann", [KeyScope.SCAN], life=timedelta(hours=1))
     page = visit(service, "devices", key=secret, ignored=COMPLAINT)
     page.get_by_text("Logged in as Ann").wait_for()
     kept = json.loads(keys.read_text())

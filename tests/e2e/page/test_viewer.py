@@ -18,8 +18,7 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.model import Mesh
-from slrig.scan.mesh_formats import encode_mesh_glb
-from slrig.scan.view_format import encode_coarse_glb, encode_view_glb
+from slrig.scan.formats import encode_coarse_glb, encode_mesh_glb, encode_view_glb
 from tests.npm import npm_package
 from tests.unit.scan.test_mesh_formats import half_ball
 

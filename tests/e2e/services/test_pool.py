@@ -21,8 +21,7 @@ from urllib.parse import urlsplit
 import httpx2
 import pytest
 
-from slrig.jobs.compute import Compute
-from slrig.jobs.worker import Worker
+from slrig.jobs.worker import Compute, Worker
 from slrig.scan.job import PIPELINE
 from tests.e2e.conftest import Start, write_rig
 from tests.listening import free_port, listening_at
@@ -31,8 +30,7 @@ from tests.unit.command import done
 from tests.unit.scan.fakes import reconstruction
 
 if TYPE_CHECKING:
-    from slrig.compute.cluster import DaskCluster
-    from slrig.compute.pooled import PooledWorker
+    from slrig.compute.pooled import DaskCluster, PooledWorker
 
 SECRET = "the-secret-of-the-store"  # noqa: S105 - nothing but a test's
 BUCKET = "s3://scans/hall-3"
@@ -172,10 +170,8 @@ class Pool:
 
     def rig(self, local: Compute, *, wired: bool = False) -> tuple[PooledWorker, DaskCluster]:
         """A service's worker, begun, and its connection; `service` is in the environment already."""
-        from slrig.compute.cluster import DaskCluster
-        from slrig.compute.pooled import PooledWorker
-        from slrig.compute.security import pool_security
-        from slrig.compute.store import open_store
+        from slrig.compute.host import open_store
+        from slrig.compute.pooled import DaskCluster, PooledWorker, pool_security
 
         address = self.service(wired=wired)["SLRIG_COMPUTE"]
         cluster = DaskCluster(address, pool_security(address, self.certificates))

@@ -18,7 +18,7 @@ import pytest
 
 from slrig.api.calibration import MOST_IMPORT_BYTES
 from slrig.client import Client
-from slrig.client.events import Progress
+from slrig.client.connection import Progress
 from tests.e2e.conftest import KEY, SLOW, ServiceProcess, ended, serving, write_rig
 from tests.listening import free_port
 from tests.npm import lacking

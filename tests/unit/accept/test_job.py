@@ -11,12 +11,11 @@ from uuid import UUID, uuid4
 
 import pytest
 
-from slrig.accept import running as acceptance
-from slrig.accept.asking import AcceptanceRequest
+from slrig.accept import job as acceptance
 from slrig.accept.evaluation import Reading
 from slrig.accept.job import AcceptanceTests, PositionJob
-from slrig.accept.plan import AcceptancePlan, usual_limits
-from slrig.accept.records import AcceptanceState, record_from_json, record_json
+from slrig.accept.plan import AcceptancePlan, AcceptanceRequest, usual_limits
+from slrig.accept.store import AcceptanceState, record_from_json, record_json
 from slrig.calibration.artefacts import Decision
 from slrig.devices import Rig
 from slrig.errors import (

@@ -8,10 +8,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slrig.accept.plan import AcceptancePlan, Artefact, Artefacts, Certified, Limits, Quantity, usual_limits
-from slrig.accept.positions import acceptance_plan, rig_volume_mm
-from slrig.accept.scene import turn_deg
-from slrig.accept.uncertainty import error_uncertainty
+from slrig.accept.evaluation import error_uncertainty
+from slrig.accept.plan import (
+    AcceptancePlan,
+    Artefact,
+    Artefacts,
+    Certified,
+    Limits,
+    Quantity,
+    acceptance_plan,
+    rig_volume_mm,
+    turn_deg,
+    usual_limits,
+)
 from slrig.errors import InvalidInputError
 from slrig.model import Calibration, Pinhole, Size
 

@@ -18,30 +18,41 @@ import pytest
 from numpy.typing import NDArray
 from rich.console import Console
 
-from slrig.accept import running as acceptance
-from slrig.accept.evaluation import Reading, ReadingPoints, reading
-from slrig.accept.plan import AcceptancePlan, Artefact, Artefacts, Certified, Limits, Quantity, Step, usual_limits
-from slrig.accept.positions import acceptance_plan
-from slrig.accept.records import AcceptanceRecord, AcceptanceState, record_from_json, record_json
+from slrig.accept import job as acceptance
+from slrig.accept.evaluation import AcceptanceResult, Reading, ReadingPoints, reading, scale_by_bar, verdicts
+from slrig.accept.plan import (
+    AcceptancePlan,
+    Artefact,
+    Artefacts,
+    Certified,
+    Limits,
+    Quantity,
+    Step,
+    acceptance_plan,
+    usual_limits,
+)
 from slrig.accept.report import document, report_html
-from slrig.accept.running import run_acceptance
-from slrig.accept.scale import scale_by_bar
-from slrig.accept.verdicts import AcceptanceResult, verdicts
+from slrig.accept.store import AcceptanceRecord, AcceptanceState, record_from_json, record_json
 from slrig.calibration.artefacts import Decision
-from slrig.cli.accept import tell
+from slrig.cli.accept import measure_positions, tell
 from slrig.devices import Rig
 from slrig.errors import (
     CalibrationError,
-    InvalidInputError,
     NothingToReconstructError,
     ScanCancelledError,
     SlrigError,
     UnsupportedByDeviceError,
 )
+from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.database import Database
+from slrig.jobs.store import JobStore
 from slrig.model import Calibration, FloatArray, Mesh
 from slrig.scan.artefacts import encode_mesh_ply
 from tests.unit.accept.test_plan import GOOD, VOLUME, device
-from tests.unit.scan.fakes import TamePositioner, TameRecording
+from tests.unit.jobs.tame_compute import TameCompute
+from tests.unit.jobs.tame_manager import TameManager
+from tests.unit.scan.bench import PIPELINE
+from tests.unit.scan.fakes import TamePositioner, TameProjector, TameRecording
 
 CAMERA = device()
 RIG = Calibration({"left": CAMERA}, CAMERA)
@@ -222,9 +233,18 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Accept
         **asked: Any,
     ) -> AcceptanceResult:
         positioner = TamePositioner(tuple(step.name for step in plan.steps) if names is None else names)
-        rig = Rig("tame", {}, None, {}, calibration, positioner=positioner)  # type: ignore[arg-type]
+        rig = Rig("tame", {}, TameProjector(), {}, calibration, positioner=positioner)
         take_scans_from(monkeypatch, plan, scan)
-        return run_acceptance(rig, plan, tmp_path / "out", progress=lambda *_: None, cancelled=cancelled, **asked)
+        folder = DataFolder(tmp_path / "data")
+        database = Database(folder.database)
+        manager = TameManager(JobStore(database), folder, rig, TameCompute(PIPELINE))
+        manager.cancelled = cancelled
+        try:
+            stated = replace(plan, rendered=False)
+            return measure_positions(manager, stated, tmp_path / "out", progress=lambda *_: None, **asked)
+        finally:
+            database.close()
+            folder.release()
 
     return go
 
@@ -293,21 +313,15 @@ def test_rig_that_cannot_be_tested_is_refused_before_anything_is_written(
     assert not (tmp_path / "out").exists()
 
 
-def test_results_are_not_mixed_with_other_files(run: Callable[..., AcceptanceResult], tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "letter.txt").write_text("dear")
-    with pytest.raises(InvalidInputError, match="is not empty"):
-        run(SHORT)
-
-
 def test_a_cancelled_test_keeps_its_points_and_writes_no_report(
     run: Callable[..., AcceptanceResult], tmp_path: Path
 ) -> None:
-    answers = iter([False, True])
-    with pytest.raises(ScanCancelledError, match="cancelled before"):
-        run(SHORT, cancelled=lambda: next(answers))
+    # While the first capture of the second position is taken.
+    with pytest.raises(ScanCancelledError, match="cancelled before sphere-2"):
+        run(SHORT, cancelled=lambda: any((tmp_path / "data").rglob("sphere-1/readings.json")))
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["positions"]
-    assert [path.name for path in (tmp_path / "out" / "positions" / "sphere-1").iterdir()] == ["1.npz"]
+    kept = (tmp_path / "out" / "positions" / "sphere-1").iterdir()
+    assert sorted(path.name for path in kept) == ["1.npz", "2.npz"]
 
 
 def test_an_artefact_that_was_not_found_is_placed_again(run: Callable[..., AcceptanceResult]) -> None:
@@ -320,11 +334,10 @@ def test_an_artefact_that_was_not_found_is_placed_again(run: Callable[..., Accep
         forgotten = step.name == "sphere-2" and placed.count("sphere-2") == 1
         return scan_of(step_of(Artefact.PLANE)) if forgotten else scan_of(step)
 
-    def again(step: Step, error: SlrigError) -> bool:
+    def again(step: Step, error: SlrigError) -> None:
         refused.append(f"{step.name} {error}")
-        return True
 
-    result = run(plan, scan=scan, place=lambda _rig, step, /: placed.append(step.name), again=again)
+    result = run(plan, scan=scan, place=lambda step: placed.append(step.name), again=again)
     assert placed == ["sphere-1", "sphere-2", "sphere-2"]
     assert result.complete
     assert len(refused) == 1

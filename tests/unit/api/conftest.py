@@ -13,7 +13,7 @@ from fastapi import APIRouter, FastAPI
 from fastapi.testclient import TestClient
 
 from slrig.api.app import create_app
-from slrig.api.keys import KeyRing
+from slrig.api.auth import KeyRing
 from slrig.api.problems import install_problems
 from slrig.api.server import KINDS
 from slrig.api.service import Service, _of_request
@@ -21,18 +21,16 @@ from slrig.bundle.options import ScanDefaults
 from slrig.cli.options import ServiceOptions
 from slrig.client import Client
 from slrig.config import ServiceSettings
-from slrig.jobs.compute import Compute
-from slrig.jobs.copies import Copies
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.manager import JobManager
-from slrig.jobs.outbox import Outbox
 from slrig.jobs.records import JobState
-from slrig.jobs.store import JobStore
+from slrig.jobs.store import Copies, JobStore, Outbox
+from slrig.jobs.worker import Compute
 from slrig.rig.session import RigSession
 from tests.unit.calibrate.calibration_bench import TameCalibrating
-from tests.unit.combine.model_bench import TameCombining
 from tests.unit.jobs.tame_compute import TameCompute
+from tests.unit.model_jobs.model_bench import TameCombining
 from tests.unit.scan.bench import PIPELINE
 from tests.unit.scan.fakes import WAIT_S, TameBench
 from tests.unit.stand_ins import stand_ins
@@ -58,7 +56,7 @@ class ServedBench(TameBench):
         self.tame, self.combining = TameCalibrating(), TameCombining()
         patched = ExitStack()
         functions: dict[str, Callable[..., Any]] = {
-            "combine.combining.combine_into": self.combining,
+            "model_jobs.combining.combine_into": self.combining,
             # The fake reconstruction reports no residuals: each scan would log the traceback of a defect.
             "calibrate.verification.RigHealth._note_scan": lambda *_: None,
         }

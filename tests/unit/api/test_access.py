@@ -18,15 +18,24 @@ from starlette.types import Receive, Send
 from starlette.types import Scope as ASGIScope
 
 from slrig import KEY_VARIABLE
-from slrig.api import access
-from slrig.api.access import Access, Rates, Refused
+from slrig.api import auth as access
 from slrig.api.app import bare_app, create_app
-from slrig.api.keys import ALL_SCOPES, FIRST_NAME, GIVEN_NAME, Key, KeyRing, first_key
-from slrig.api.openapi import text
-from slrig.api.problems import _CODES, explanations
-from slrig.api.scopes import READING, Scope, needed_scope
+from slrig.api.auth import (
+    ALL_SCOPES,
+    FIRST_NAME,
+    GIVEN_NAME,
+    LINK_PATH,
+    Access,
+    Key,
+    KeyRing,
+    Rates,
+    Refused,
+    Sessions,
+    first_key,
+)
+from slrig.api.problems import _CODES, explanations, text
+from slrig.api.scopes import READING, KeyScope, needed_scope
 from slrig.api.server import _keys
-from slrig.api.sessions import LINK_PATH, Sessions
 from slrig.config import ServiceSettings
 from slrig.errors import ConfigError, StorageError
 from slrig.failure import errors_by_code
@@ -205,12 +214,12 @@ def known(keys: KeyRing, key: str | None) -> Key:
 
 
 def test_key_is_shown_once_and_kept_as_its_digest(tmp_path: Path) -> None:
-    key = ring_in(tmp_path).add("Ann", [Scope.SCAN])
+    key = ring_in(tmp_path).add("Ann", [KeyScope.SCAN])
     path = tmp_path / "keys.json"
     assert key not in path.read_text()
     assert path.stat().st_mode & 0o777 == 0o600
     found = known(ring_in(tmp_path), key)
-    assert (found.name, found.scopes, found.fault(NOW)) == ("Ann", (Scope.LOOK, Scope.SCAN), None)
+    assert (found.name, found.scopes, found.fault(NOW)) == ("Ann", (KeyScope.LOOK, KeyScope.SCAN), None)
     assert ring_in(tmp_path).find(key[:-1]) is None
 
 
@@ -296,18 +305,18 @@ def logged_in(served: ServedBench) -> TestClient:
 
 
 @pytest.mark.usefixtures("client")
-@pytest.mark.parametrize("scope", list(Scope))
-def test_each_key_does_what_it_is_for_and_nothing_else(served: ServedBench, ring: KeyRing, scope: Scope) -> None:
+@pytest.mark.parametrize("scope", list(KeyScope))
+def test_each_key_does_what_it_is_for_and_nothing_else(served: ServedBench, ring: KeyRing, scope: KeyScope) -> None:
     mine = stranger(served, ring.add("Ann", [scope]))
     asked = {
-        Scope.LOOK: ("GET", "/scan"),
-        Scope.SCAN: ("POST", "/scan/00000000-0000-4000-8000-000000000000/cancel"),
-        Scope.CALIBRATE: ("POST", "/calibration/00000000-0000-4000-8000-000000000000/solve"),
-        Scope.ADMINISTER: ("GET", "/audit"),
+        KeyScope.LOOK: ("GET", "/scan"),
+        KeyScope.SCAN: ("POST", "/scan/00000000-0000-4000-8000-000000000000/cancel"),
+        KeyScope.CALIBRATE: ("POST", "/calibration/00000000-0000-4000-8000-000000000000/solve"),
+        KeyScope.ADMINISTER: ("GET", "/audit"),
     }
     for needed, (method, path) in asked.items():
         response = mine.request(method, path)
-        if needed in {Scope.LOOK, scope}:
+        if needed in {KeyScope.LOOK, scope}:
             assert response.status_code in {200, 404}, (method, path)
         else:
             assert response.status_code == 403, (method, path)
@@ -315,7 +324,7 @@ def test_each_key_does_what_it_is_for_and_nothing_else(served: ServedBench, ring
             assert f"--scope {needed}" in response.json()["detail"]
     assert mine.get("/session").json() == {
         "name": "Ann",
-        "scopes": sorted({Scope.LOOK, scope}, key=list(Scope).index),
+        "scopes": sorted({KeyScope.LOOK, scope}, key=list(KeyScope).index),
         "expires_at": None,
     }
 
@@ -327,9 +336,11 @@ def test_every_operation_has_the_scope_of_its_path() -> None:
             assert operation.get("x-scope", scope) == scope
             if method.upper() in READING:
                 moving = path.startswith("/preview/")
-                assert scope is (Scope.SCAN if moving else Scope.ADMINISTER if path == "/audit" else Scope.LOOK)
+                assert scope is (
+                    KeyScope.SCAN if moving else KeyScope.ADMINISTER if path == "/audit" else KeyScope.LOOK
+                )
             elif not path.startswith(("/session", "/schedule", "/preset")):
-                assert scope in {Scope.SCAN, Scope.CALIBRATE}, (method, path)
+                assert scope in {KeyScope.SCAN, KeyScope.CALIBRATE}, (method, path)
 
 
 @pytest.mark.usefixtures("client")
@@ -473,7 +484,7 @@ def test_own_pages_and_programs_are_served(client: TestClient, served: ServedBen
 
 
 def test_name_of_the_key_is_on_record(client: TestClient, served: ServedBench, ring: KeyRing) -> None:
-    scan = stranger(served, ring.add("Ann", [Scope.SCAN])).post("/scan").json()
+    scan = stranger(served, ring.add("Ann", [KeyScope.SCAN])).post("/scan").json()
     assert scan["requested_by"] == "Ann"
     assert ended(client, scan["id"])["requested_by"] == "Ann"
     assert stranger(served, ring.add("Bob", [])).post("/scan").status_code == 403

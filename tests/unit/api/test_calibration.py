@@ -16,7 +16,7 @@ from slrig.calibration.board import DEFAULT_BOARD, Board, BoardKind
 from slrig.calibration.printing import board_pdf
 from slrig.errors import SolveRefusedError
 from slrig.model import Size
-from slrig.scan.plan_check import pattern_sequence
+from slrig.scan.plan import pattern_sequence
 from tests.unit.api.conftest import ServedBench, ended, refusal
 from tests.unit.api.test_scans import events_of
 from tests.unit.calibrate.calibration_bench import PNG, tame_calibration

@@ -8,11 +8,10 @@ from uuid import UUID, uuid4
 import pytest
 from fastapi.testclient import TestClient
 
-from slrig.combine.offered import MEDIA_TYPES
-from slrig.combine.plan import GivenPoses, MarkerPoses, StatedAxis, TurntablePoses, UnknownPoses
 from slrig.errors import RegistrationRefusedError
+from slrig.model_jobs.plan import MEDIA_TYPES, GivenPoses, MarkerPoses, StatedAxis, TurntablePoses, UnknownPoses
 from tests.unit.api.conftest import ServedBench, ended, refusal
-from tests.unit.combine.model_bench import kept_scan, until_told
+from tests.unit.model_jobs.model_bench import kept_scan, until_told
 
 AXIS = {"point_mm": [4.0, 45.0, 12.0], "direction": [0.0, -1.0, 0.0]}
 STILL = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]

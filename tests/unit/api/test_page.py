@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from slrig.api.page import FOLDER, policy
 from slrig.api.rig import encoded, marked_picture
+from slrig.api.system import FOLDER, policy
 from tests.unit.api.conftest import ServedBench
 from tests.unit.api.test_access import stranger
 

@@ -22,10 +22,8 @@ from slrig.devices import CameraInfo, ProjectorInfo, Trigger
 from slrig.errors import ConfigError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Region, Size
 from slrig.rig.session import RigFacts
-from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
-from slrig.scan.plan_check import check_plan
-from slrig.scan.presets import SHIPPED, Presets
-from slrig.scan.records import plan_from_json, plan_json
+from slrig.scan.job import plan_from_json, plan_json
+from slrig.scan.plan import SHIPPED, PatternPlan, Presets, ReconstructionPlan, ScanPlan, check_plan
 from tests.unit.api.conftest import ServedBench, ended, refusal
 
 RIG = 'name = "bench"\n[head]\ndriver = "simulated"\n[scan]\n'

@@ -12,17 +12,17 @@ from uuid import UUID
 import pytest
 from fastapi.testclient import TestClient
 
-from slrig.accept.asking import AcceptanceRequest
+from slrig.accept.plan import AcceptanceRequest
 from slrig.api import acceptance as router_module
-from slrig.api import health, turntable
-from slrig.calibrate.records import PoseRecord, SessionRecord
+from slrig.api import rig
+from slrig.calibrate.store import PoseRecord, SessionRecord
 from slrig.calibrate.verification import HealthStore
 from slrig.calibration.board import DEFAULT_BOARD
-from slrig.combine.turntable import TurntableStore
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
-from slrig.jobs.keys import RequestKeys
 from slrig.jobs.records import JobState
+from slrig.jobs.store import RequestKeys
+from slrig.model_jobs.turntable import TurntableStore
 from slrig.multiview.turntable import BoardAxis, axis_from_board, find_turntable_planes
 from tests.unit.accept.test_job import PLAN, Desk, desk, desks
 from tests.unit.api.conftest import app_of, refusal
@@ -58,7 +58,7 @@ def health_client(folder: DataFolder, verifying: Verifying) -> Iterator[TestClie
         folder=folder, manager=manager, store=manager.store, health=verifying.health,
         keys=RequestKeys(manager.store.database), refuse_when_stale=True, calibrations=SimpleNamespace(active=None),
     )  # fmt: skip
-    with TestClient(app_of(health.router, service)) as found:
+    with TestClient(app_of(rig.health_router, service)) as found:
         yield found
 
 
@@ -138,10 +138,10 @@ def turntable_client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterato
         store=SimpleNamespace(get=lambda *_: SimpleNamespace(state=JobState.SUCCEEDED)),
         worker=TameCompute(PIPELINE),
     )
-    monkeypatch.setattr(turntable, "session_readings", lambda _: readings)
-    monkeypatch.setattr(turntable, "turntable_axis", found)
-    monkeypatch.setattr(turntable, "turntable_planes", lambda *_: find_turntable_planes(PLATE, AXIS))
-    with TestClient(app_of(turntable.router, service)) as made:
+    monkeypatch.setattr(rig, "session_readings", lambda _: readings)
+    monkeypatch.setattr(rig, "turntable_axis", found)
+    monkeypatch.setattr(rig, "turntable_planes", lambda *_: find_turntable_planes(PLATE, AXIS))
+    with TestClient(app_of(rig.turntable_router, service)) as made:
         yield made
     folder.release()
 

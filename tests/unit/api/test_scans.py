@@ -21,10 +21,10 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from slrig.api import clouds
-from slrig.api.artefacts import _made_so_far, ready_files
-from slrig.api.idempotency import fingerprint, own_key
+from slrig.api import files as clouds
+from slrig.api.files import _made_so_far, ready_files
 from slrig.api.schemas import ScanRequest
+from slrig.api.service import fingerprint, own_key
 from slrig.bundle.calibration import write_calibration
 from slrig.bundle.writing import BundleWriter
 from slrig.devices import Rig
@@ -33,7 +33,7 @@ from slrig.jobs import data_folder
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.records import JobState
 from slrig.jobs.store import JobStore
-from slrig.jobs.worker_process import Task
+from slrig.jobs.worker import Task
 from slrig.model import Calibration, CameraFormat, Pinhole, Shot, Size, White
 from slrig.scan.acquisition import Recording, capture_frames
 from slrig.scan.artefacts import ON_REQUEST

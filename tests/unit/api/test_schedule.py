@@ -16,8 +16,8 @@ from fastapi.testclient import TestClient
 from typer.testing import Result
 
 from slrig.bundle.calibration import write_calibration
-from slrig.schedule.records import RunState
-from slrig.schedule.rig_tasks import Stop
+from slrig.schedule.scheduler import Stop
+from slrig.schedule.store import RunState
 from tests.unit import command
 from tests.unit.api.conftest import ServedBench, refusal
 from tests.unit.command import refused, slrig

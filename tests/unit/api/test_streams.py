@@ -20,8 +20,10 @@ from fastapi.testclient import TestClient
 from sse_starlette import ServerSentEvent
 from starlette.types import Receive, Scope, Send
 
-from slrig.api import connections
-from slrig.api.connections import (
+from slrig.api import server as connections
+from slrig.api.events import Followed, OpenStreams, followed_feed, followed_job
+from slrig.api.events import told as stream_of
+from slrig.api.server import (
     ConnectionConfig,
     Deadlines,
     HttpConnection,
@@ -30,8 +32,6 @@ from slrig.api.connections import (
     quiet_accepts,
     raise_descriptor_limit,
 )
-from slrig.api.events import Followed, OpenStreams, followed_feed, followed_job
-from slrig.api.events import told as stream_of
 from slrig.failure import JobFailure
 from slrig.jobs.database import Database
 from slrig.jobs.records import JobEvent, JobKind, JobProgress, JobState

@@ -13,16 +13,16 @@ from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
 from starlette.types import Message, Receive, Scope, Send
 
-from slrig.api import latency
-from slrig.api.latency import Durations, Latency
+from slrig.api import service as latency
+from slrig.api.service import Durations, Latency
 from slrig.capture import CameraLatency, LatencyMeasurement
 from slrig.conformance import CheckOutcome, CheckResult, ConformanceReport, Failure
 from slrig.conformance import job as conforming
 from slrig.devices import AppliedSettings, CameraSettings
 from slrig.doctor import job as examining
+from slrig.doctor import keep
 from slrig.errors import ScanEvidenceError
-from slrig.jobs.examinations import keep
-from slrig.rig.settings import SettingsInUse
+from slrig.rig.watchdog import SettingsInUse
 from tests.unit.api.conftest import ServedBench, client_of, ended
 from tests.unit.api.test_access import PATHS, filled
 from tests.unit.command import done, refused, slrig

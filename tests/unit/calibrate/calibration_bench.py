@@ -13,10 +13,9 @@ from uuid import UUID
 import numpy as np
 
 from slrig.api.server import KINDS
-from slrig.calibrate.calibrating import Calibrations, PoseRequest
-from slrig.calibrate.pose_judging import Judgement, SessionGuidance
-from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState, Setting
-from slrig.calibrate.solving import CalibrationResult, ReadPose
+from slrig.calibrate.job import Calibrations, PoseRequest
+from slrig.calibrate.report import Judgement, SessionGuidance
+from slrig.calibrate.store import CalibrationResult, PoseRecord, ReadPose, SessionRecord, SessionState, Setting
 from slrig.calibration.board import Board, BoardKind, BoardShape, BoardView, PoseObservation, ViewQuality
 from slrig.devices import Rig
 from slrig.errors import PoseRefusedError
@@ -86,17 +85,15 @@ class TameCalibrating:
         return stand_ins(
             {
                 "calibrate.pose_reading.read_pose": self._read,
-                "calibrate.pose_judging.judgement": self._judge,
-                "calibrate.pose_judging.standing": lambda poses, _: SessionGuidance(
+                "calibrate.report.judgement": self._judge,
+                "calibrate.report.standing": lambda poses, _: SessionGuidance(
                     {"poses": [each.observation.name for each in poses]}, {}
                 ),
-                "calibrate.pose_judging.write_report": lambda path, *_: path.write_text("<html>report</html>"),
-                "calibrate.pose_judging.summary": lambda _: {
-                    "verdict": {"grade": "good", "summary": "good", "reasons": []}
-                },
-                "calibrate.pose_pictures.pose_png": lambda *_: PNG,
-                "calibrate.pose_pictures.coverage_png": lambda _, device, poses, __: f"{device} {len(poses)}".encode(),
-                "calibrate.solving.solve_poses": self._solve,
+                "calibrate.report.write_report": lambda path, *_: path.write_text("<html>report</html>"),
+                "calibrate.report.summary": lambda _: {"verdict": {"grade": "good", "summary": "good", "reasons": []}},
+                "calibrate.report.pose_png": lambda *_: PNG,
+                "calibrate.report.coverage_png": lambda _, device, poses, __: f"{device} {len(poses)}".encode(),
+                "calibrate.store.solve_poses": self._solve,
             }
         )
 

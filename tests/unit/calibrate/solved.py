@@ -9,7 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from slrig.calibrate.solving import CalibrationResult, ReadPose
+from slrig.calibrate.store import CalibrationResult, ReadPose
 from slrig.calibration.accuracy import OddEven
 from slrig.calibration.board import Board, BoardKind, BoardView, Correspondences, PoseObservation, ViewQuality
 from slrig.calibration.judgement import judge_calibration

@@ -15,11 +15,8 @@ import pytest
 from structlog.testing import capture_logs
 
 from slrig.bundle.calibration import read_calibration, write_calibration
-from slrig.calibrate.calibrating import PoseRequest
-from slrig.calibrate.jobs import PoseJob
-from slrig.calibrate.records import SessionRecord, SessionState, with_jobs
-from slrig.calibrate.retention import Retention, named_by_scans
-from slrig.calibrate.store import CalibrationStore, session_readings
+from slrig.calibrate.job import PoseJob, PoseRequest, Retention, named_by_scans
+from slrig.calibrate.store import CalibrationStore, SessionRecord, SessionState, session_readings, with_jobs
 from slrig.errors import (
     ArtefactNotReadyError,
     CalibrationError,

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from slrig.bundle import write_bundle
-from slrig.calibrate.pose_frames import bundle_device_sizes
-from slrig.calibrate.pose_movement import moved_px
-from slrig.calibrate.pose_reading import read_captured, read_pose
-from slrig.calibrate.solving import ReadPose
+from slrig.calibrate.pose_reading import bundle_device_sizes, moved_px, read_captured, read_pose
+from slrig.calibrate.store import ReadPose
 from slrig.calibration.board import COLUMN, ROW, Board, BoardKind, Correspondences
 from slrig.calibration.detection.detection import board_mask, find_board
 from slrig.calibration.poses.checks import LIMITS

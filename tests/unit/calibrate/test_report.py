@@ -15,18 +15,22 @@ import pytest
 from rich.console import Console
 
 from slrig.bundle.calibration import require_two_rays
-from slrig.calibrate.charts import error_slices
-from slrig.calibrate.figures import baselines, device_figures, pose_figures
-from slrig.calibrate.pose_judging import judgement, summary
-from slrig.calibrate.records import Setting
-from slrig.calibrate.report import report_html
-from slrig.calibrate.solving import CalibrationResult, ReadPose, solve_poses
+from slrig.calibrate.report import (
+    baselines,
+    device_figures,
+    error_slices,
+    judgement,
+    pose_figures,
+    report_html,
+    summary,
+)
+from slrig.calibrate.store import CalibrationResult, ReadPose, Setting, solve_poses
 from slrig.calibration.accuracy import compare_calibrations
 from slrig.calibration.board import BoardShape, ViewQuality
 from slrig.calibration.health.verification import verify_by_board
 from slrig.calibration.judgement import Grade
 from slrig.calibration.solution import PROJECTOR
-from slrig.cli.calibration_screen import tell_result
+from slrig.cli.calibrate_walk import tell_result
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, Size
 from tests.unit.calibrate.solved import (

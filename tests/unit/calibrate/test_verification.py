@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from slrig.bundle import write_calibration
-from slrig.calibrate.solving import ReadPose
-from slrig.calibrate.trend import health_svg
+from slrig.calibrate.store import ReadPose
 from slrig.calibrate.verification import (
     HealthStore,
     RigHealth,
     VerificationJob,
     VerificationRecord,
     health_stamp,
+    health_svg,
     require_healthy,
     verify_bundle,
 )

@@ -14,7 +14,7 @@ from slrig.calibration.board import Board, BoardKind, BoardView
 from slrig.calibration.detection.detection import find_board
 from slrig.calibration.detection.lattice import equivalent_numberings, rotate_half_turn
 from slrig.calibration.printing import FIT, PAGES_MM, artwork, board_pdf, board_svg, charuco_board
-from slrig.cli.boards import board_option
+from slrig.cli.calibrate_local import board_option
 from slrig.errors import CalibrationError
 from tests.unit.calibration.painted import board_points
 

@@ -26,8 +26,7 @@ from slrig.capture.verifier import Evidence, EvidenceSummary, Sampler, check_cap
 from slrig.errors import ScanEvidenceError
 from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, SequenceName, Shot, Size, White
 from slrig.patterns.sequence import encode
-from slrig.scan.plan import PatternPlan
-from slrig.scan.plan_check import pattern_sequence
+from slrig.scan.plan import PatternPlan, pattern_sequence
 from tests.unit.capture.fake_rig import PROJECTOR, Scene, add_agreeing_shot, patterns_for
 
 PATTERNS = patterns_for()

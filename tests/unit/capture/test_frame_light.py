@@ -16,8 +16,7 @@ from slrig.capture.frame_checks import ReferenceFrames, Samples, build_reference
 from slrig.capture.frame_light import FrameLight, fit_pair_light, line_lights, pair_lights, repeat_light
 from slrig.capture.verifier import EvidenceSummary, check_capture
 from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, SequenceName, Shot, White
-from slrig.scan.plan import PatternPlan
-from slrig.scan.plan_check import pattern_sequence
+from slrig.scan.plan import PatternPlan, pattern_sequence
 from tests.unit.capture.fake_rig import PROJECTOR, Scene, patterns_for
 
 COUNT = 12_000

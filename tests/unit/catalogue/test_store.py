@@ -19,18 +19,14 @@ from alembic.migration import MigrationContext
 from sqlalchemy import text, update
 from structlog.testing import capture_logs
 
-from slrig.catalogue import copying, store
-from slrig.catalogue.copying import Copier
-from slrig.catalogue.fleet import BEAT_S
-from slrig.catalogue.store import Catalogue, open_catalogue
-from slrig.catalogue.tables import CatalogueBase, RigRow
+from slrig.catalogue import store
+from slrig.catalogue import store as copying
+from slrig.catalogue.store import BEAT_S, Catalogue, CatalogueBase, Copier, RigRow, open_catalogue
 from slrig.errors import CatalogueError, ConfigError
 from slrig.failure import JobFailure
-from slrig.jobs.copies import Copies
 from slrig.jobs.database import Database
-from slrig.jobs.outbox import Outbox
 from slrig.jobs.records import JobKind, JobState
-from slrig.jobs.store import JobStore
+from slrig.jobs.store import Copies, JobStore, Outbox
 from tests.listening import free_port
 from tests.postgres import LOGIN, PASSWORD, Postgres
 from tests.unit.schedule.receivers import own_certificate

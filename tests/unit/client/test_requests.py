@@ -18,7 +18,7 @@ import pytest
 from PIL import Image
 
 from slrig.client import Client
-from slrig.client.connection import PATIENCE_S, Resource
+from slrig.client.connection import PATIENCE_S, Captured, Progress, Resource, StateChange
 from slrig.client.errors import (
     ConflictError,
     ForeignAnswerError,
@@ -28,7 +28,6 @@ from slrig.client.errors import (
     UnauthorizedError,
     UnreachableError,
 )
-from slrig.client.events import Captured, Progress, StateChange
 from slrig.client.resources import ScanFields
 from slrig.errors import ConfigError, ServiceError, StorageError
 from tests.unit.client.service import URL, Broken, client_of, event_answer, failing, stream

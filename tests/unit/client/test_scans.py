@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 from slrig.client import Cloud
+from slrig.client.client import shown
+from slrig.client.connection import Captured, Event, FileReady, Progress, StateChange
 from slrig.client.errors import ScanFailedError
-from slrig.client.events import Captured, Event, FileReady, Progress, StateChange
-from slrig.client.notebook import shown
 from slrig.errors import ScanCancelledError, ServiceError
 from slrig.model.surface import srgb_to_linear
 from slrig.scan.artefacts import encode_mesh_ply

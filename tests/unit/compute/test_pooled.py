@@ -30,13 +30,34 @@ from distributed import Scheduler, Status
 from distributed.diskutils import DIR_LOCK_EXT
 from obstore.store import MemoryStore
 
-from slrig.compute.certificates import AUTHORITY_KEY, make_certificates
-from slrig.compute.cluster import DaskCluster, Told
-from slrig.compute.host import BEAT_S, POOL_FAULT, TELL_S, Host, PoolRequest, PoolResponse, resource
-from slrig.compute.pooled import BEGIN_LIMIT_S, SILENCE_LIMIT_S, TRANSFER_LIMIT_S, PooledWorker
-from slrig.compute.security import KEY, pool_security
-from slrig.compute.serving import KEPT_EVENTS, _scratch, serve_scheduler
-from slrig.compute.store import CHUNK_BYTES, PoolError, PoolStore, open_store
+from slrig.compute.host import (
+    BEAT_S,
+    CHUNK_BYTES,
+    KEPT_EVENTS,
+    POOL_FAULT,
+    TELL_S,
+    Host,
+    PoolError,
+    PoolRequest,
+    PoolResponse,
+    PoolStore,
+    _scratch,
+    open_store,
+    resource,
+    serve_scheduler,
+)
+from slrig.compute.pooled import (
+    AUTHORITY_KEY,
+    BEGIN_LIMIT_S,
+    KEY,
+    SILENCE_LIMIT_S,
+    TRANSFER_LIMIT_S,
+    DaskCluster,
+    NewsCallback,
+    PooledWorker,
+    make_certificates,
+    pool_security,
+)
 from slrig.errors import (
     ConfigError,
     NothingToReconstructError,
@@ -47,11 +68,9 @@ from slrig.errors import (
     WorkerLostError,
 )
 from slrig.jobs.data_folder import RESULT
-from slrig.jobs.frame_feed import FrameFeed
-from slrig.jobs.job import JobRun
-from slrig.jobs.versions import versions
-from slrig.jobs.worker import READY
-from slrig.jobs.worker_process import Task
+from slrig.jobs.database import versions
+from slrig.jobs.job import FrameFeed, JobRun
+from slrig.jobs.worker import READY, Task
 from slrig.model import Region
 from tests.listening import listening_at
 from tests.unit.command import slrig
@@ -102,7 +121,9 @@ class TameWorker:
 class TameOrder(Future[PoolResponse]):
     """An order: `act` is asked for its answer."""
 
-    def __init__(self, act: Callable[[PoolRequest], PoolResponse | None], order: PoolRequest, told: Told) -> None:
+    def __init__(
+        self, act: Callable[[PoolRequest], PoolResponse | None], order: PoolRequest, told: NewsCallback
+    ) -> None:
         super().__init__()
         self._act = act
         self.order = order
@@ -135,7 +156,7 @@ class TameCluster:
     def usable(self, timeout_s: float = 0.0) -> bool:  # noqa: ARG002
         return self.there
 
-    def submit(self, order: PoolRequest, told: Told) -> TameOrder:
+    def submit(self, order: PoolRequest, told: NewsCallback) -> TameOrder:
         act = self.acts.pop(0) if self.acts else lambda each: self.host.done(each, self.told.append)
         self.orders.append(TameOrder(act, order, told))
         return self.orders[-1]
@@ -505,7 +526,7 @@ def test_workers_abilities_are_queried_when_they_change(monkeypatch: pytest.Monk
                 raise OSError("gone")
             return {"n_workers": len(members), "workers": members if n_workers else {}}
 
-    monkeypatch.setattr("slrig.compute.cluster.LOOK_S", 0.0)
+    monkeypatch.setattr("slrig.compute.pooled.LOOK_S", 0.0)
     cluster = DaskCluster("tcp://127.0.0.1:1", None)
     with pytest.raises(OSError, match="gone"):
         asyncio.run(cluster._watch(SimpleNamespace(scheduler=Scheduler())))  # type: ignore[arg-type]

@@ -34,11 +34,11 @@ from slrig.conformance.bench import (
     measure_reference_levels,
 )
 from slrig.devices import Rig
+from slrig.doctor import last_examination
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError
 from slrig.jobs import manager as managing
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
-from slrig.jobs.examinations import last_examination
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import JobState
 from slrig.jobs.store import JobStore

@@ -29,8 +29,7 @@ from slrig.model import (
     White,
 )
 from slrig.patterns.sequence import encode
-from slrig.scan.plan import PatternPlan
-from slrig.scan.plan_check import pattern_sequence
+from slrig.scan.plan import PatternPlan, pattern_sequence
 
 PROJECTOR = Size(16, 8)
 CAMERA = Size(6, 4)

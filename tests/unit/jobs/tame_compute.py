@@ -12,10 +12,8 @@ from typing import Any
 
 from slrig.errors import ScanCancelledError, WorkerBusyError
 from slrig.failure import interruption_error
-from slrig.jobs.frame_feed import FedCaptures, FrameFeed
-from slrig.jobs.job import JobRun
-from slrig.jobs.worker import READY
-from slrig.jobs.worker_process import Task
+from slrig.jobs.job import FedCaptures, FrameFeed, JobRun
+from slrig.jobs.worker import READY, Task
 from slrig.model import Region
 from tests.unit.scan.fakes import WAIT_S
 

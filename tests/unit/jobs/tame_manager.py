@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterable
 from slrig.api.server import KINDS
 from slrig.devices import Rig
 from slrig.errors import QueueFullError, RigBusyError
-from slrig.jobs.compute import Compute
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.job import Job
 from slrig.jobs.manager import JobManager, _Work
 from slrig.jobs.store import JobStore
+from slrig.jobs.worker import Compute
 from slrig.rig.session import RigSession
 
 

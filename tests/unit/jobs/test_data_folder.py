@@ -21,6 +21,7 @@ from structlog.testing import capture_logs
 
 from slrig.api.server import ADDRESS_FILE, KINDS
 from slrig.devices import Rig
+from slrig.doctor import keep, last_examination
 from slrig.doctor.doctor import Diagnosis
 from slrig.doctor.light import fault, ok
 from slrig.errors import DataFolderGoneError, DeviceGoneError, StorageError
@@ -29,14 +30,13 @@ from slrig.jobs import backup
 from slrig.jobs.backup import back_up, read_manifest, restore
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
-from slrig.jobs.examinations import keep, last_examination
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import JobKind, JobRecord, JobState, utc_now, write_record
 from slrig.jobs.resume import resume
 from slrig.jobs.store import JobStore
 from slrig.rig.session import RigSession
+from slrig.scan.job import plan_from_json, plan_json
 from slrig.scan.plan import ScanPlan
-from slrig.scan.records import plan_from_json, plan_json
 from tests.unit.jobs.tame_compute import TameCompute
 from tests.unit.scan.bench import PIPELINE, failure_code
 

@@ -16,21 +16,21 @@ from slrig.accept.evaluation import Reading
 from slrig.accept.job import AcceptanceTests
 from slrig.accept.plan import Step
 from slrig.accept.store import points_file
-from slrig.calibrate.calibrating import Calibrations, PoseRequest
+from slrig.calibrate.job import Calibrations, PoseRequest
 from slrig.calibrate.verification import HealthStore, RigHealth, VerificationJob
-from slrig.combine.job import TURNTABLE, Models
-from slrig.combine.plan import ModelPlan, StatedAxis, TurntablePoses
-from slrig.combine.turntable import TurntableStore
 from slrig.doctor import DoctorJob
 from slrig.errors import DeviceGoneError, OutOfMemoryError, RigBusyError, ScanCancelledError, ScanInterruptedError
 from slrig.jobs.records import JobKind, JobRecord, JobState
+from slrig.model_jobs.job import TURNTABLE, Models
+from slrig.model_jobs.plan import ModelPlan, StatedAxis, TurntablePoses
+from slrig.model_jobs.turntable import TurntableStore
 from slrig.rig.session import ActiveCalibration
 from slrig.scan.plan import PatternPlan
 from tests.unit.accept.test_plan import plan_of
 from tests.unit.calibrate.calibration_bench import BOARD, TameCalibrating, tame_calibration
 from tests.unit.calibrate.health_bench import a_verification
-from tests.unit.combine.model_bench import TameCombining, kept_scan
 from tests.unit.jobs.tame_compute import TameCompute
+from tests.unit.model_jobs.model_bench import TameCombining, kept_scan
 from tests.unit.scan.bench import PIPELINE, Bench, failure_code
 from tests.unit.scan.fakes import WAIT_S
 from tests.unit.stand_ins import stand_ins
@@ -75,8 +75,8 @@ class Service(Bench):
 
         functions: dict[str, Callable[..., Any]] = {
             "calibration.health.verification.verify_by_board": lambda *_: a_verification(),
-            "combine.combining.combine_into": TameCombining(),
-            "accept.running.evaluated": evaluate,
+            "model_jobs.combining.combine_into": TameCombining(),
+            "accept.job.evaluated": evaluate,
             "accept.job.write_test_report": lambda *_: None,
         }
         self.patched.enter_context(stand_ins(functions))

@@ -15,15 +15,13 @@ from sqlalchemy import create_engine, text
 
 from slrig.errors import IdempotencyError, JobNotFoundError, KeyInFlightError, StorageError
 from slrig.failure import JobFailure
-from slrig.jobs import versions as module
-from slrig.jobs.database import Database, sqlite_engine
-from slrig.jobs.keys import RequestKeys
-from slrig.jobs.progress import ProgressRecorder
+from slrig.jobs import database as module
+from slrig.jobs.database import Base, Database, sqlite_engine
+from slrig.jobs.job import ProgressRecorder
 from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, Stage, stages_of
-from slrig.jobs.store import JobStore
-from slrig.jobs.tables import Base
+from slrig.jobs.store import JobStore, RequestKeys
+from slrig.scan.job import plan_from_json, plan_json
 from slrig.scan.plan import PatternPlan, ScanPlan
-from slrig.scan.records import plan_from_json, plan_json
 from tests.unit.scan.fakes import SetClock
 
 NOON = SetClock().now

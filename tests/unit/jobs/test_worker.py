@@ -29,19 +29,32 @@ from slrig.errors import (
 )
 from slrig.failure import interruption_error, job_failure
 from slrig.jobs import worker as worker_module
-from slrig.jobs import worker_wait
-from slrig.jobs.frame_feed import (
+from slrig.jobs import worker as worker_wait
+from slrig.jobs.job import (
     LEAST_WAITING_BYTES,
     MOST_WAITING_BYTES,
     Abandon,
     Begin,
     FrameFeed,
+    Outcome,
     most_waiting_bytes,
 )
-from slrig.jobs.job import Outcome
-from slrig.jobs.worker import LOADING, READY, WAITING, UnexpectedWorkerError, Worker, prepare_kernel_cache
-from slrig.jobs.worker_process import Done, Failed, FileMade, Progressed, Task, Unloadable, serve
-from slrig.jobs.worker_wait import JobWait
+from slrig.jobs.worker import (
+    LOADING,
+    READY,
+    WAITING,
+    Done,
+    Failed,
+    FileMade,
+    JobWait,
+    Progressed,
+    Task,
+    UnexpectedWorkerError,
+    Unloadable,
+    Worker,
+    prepare_kernel_cache,
+    serve,
+)
 from slrig.model import Shot
 from slrig.scan.plan import ReconstructionPlan
 from tests.unit.scan import fake_pipeline

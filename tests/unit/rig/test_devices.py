@@ -29,10 +29,18 @@ from slrig.errors import (
 )
 from slrig.model import RotationAxis
 from slrig.rig.preview import Light, Picture, Previews, Watch
-from slrig.rig.session import RigSession
-from slrig.rig.settings import SettingsInUse
-from slrig.rig.turn_count import FROM_THE_START, CountedTurntable
-from slrig.rig.watchdog import MOVE_LIMIT_S, OPEN, Call, Calls, GuardedPositioner, GuardedTurntable, Watchdog, guarded
+from slrig.rig.session import FROM_THE_START, CountedTurntable, RigSession
+from slrig.rig.watchdog import (
+    MOVE_LIMIT_S,
+    OPEN,
+    Call,
+    Calls,
+    GuardedPositioner,
+    GuardedTurntable,
+    SettingsInUse,
+    Watchdog,
+    guarded,
+)
 from tests.unit.capture.fake_rig import CameraFaults, Scene, fake_rig
 from tests.unit.scan.bench import Bench
 from tests.unit.scan.fakes import WAIT_S, TameBench, TameCamera, TameProjector

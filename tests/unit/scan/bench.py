@@ -10,12 +10,12 @@ from uuid import UUID
 
 from slrig.api.server import KINDS
 from slrig.errors import InvalidInputError
-from slrig.jobs.compute import Compute
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import JobRecord, JobState
 from slrig.jobs.store import JobStore
+from slrig.jobs.worker import Compute
 from slrig.rig.session import RigSession
 from slrig.scan.job import ScanJob
 from slrig.scan.plan import ScanPlan

@@ -15,11 +15,11 @@ import numpy as np
 
 from slrig.capture.verifier import EvidenceSummary
 from slrig.errors import NothingToReconstructError, ScanCancelledError
-from slrig.jobs.frame_feed import FedFrames
+from slrig.jobs.job import FedFrames
 from slrig.model import Calibration, Mesh, Region, Shot
 from slrig.model.capture import CaptureHeader
 from slrig.scan.artefacts import MESH, encode_mesh_ply
-from slrig.scan.mesh_formats import encode_mesh_glb
+from slrig.scan.formats import encode_mesh_glb
 from slrig.scan.plan import ReconstructionPlan
 
 ARTEFACTS = ("points.ply", "preview.png")

@@ -18,10 +18,8 @@ from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, Displayed
 from slrig.discovery import DiscoveredDevices
 from slrig.doctor import Diagnosis
 from slrig.errors import ScanCancelledError
-from slrig.jobs.compute import job_task
-from slrig.jobs.frame_feed import FrameSink
-from slrig.jobs.job import JobRun, Recording
-from slrig.jobs.worker_process import Task
+from slrig.jobs.job import FrameSink, JobRun, Recording
+from slrig.jobs.worker import Task, job_task
 from slrig.model import Axis, Black, Calibration, CameraFormat, Capture, Frame, Gray, Pattern, Shot, Size, White
 from slrig.model.capture import CaptureHeader
 from slrig.scan.job import ScanJob
@@ -173,7 +171,7 @@ class TameBench:
 
     def captures(self) -> AbstractContextManager[None]:
         """Have every kind of job capture by `capture` within the block."""
-        modules = ("scan.job", "calibrate.jobs", "calibrate.verification", "accept.running")
+        modules = ("scan.job", "calibrate.job", "calibrate.verification", "accept.job")
         functions: dict[str, Callable[..., Any]] = {f"{module}.capture_frames": self.capture for module in modules}
         functions["doctor.job.examine"] = self.examine
         functions["doctor.job.discover_devices"] = lambda: DiscoveredDevices((), (), ())

@@ -30,7 +30,7 @@ from slrig.errors import (
     StorageError,
     UnsupportedByDeviceError,
 )
-from slrig.jobs.frame_feed import Abandon, FrameFeed
+from slrig.jobs.job import Abandon, FrameFeed
 from slrig.model import Axis, Black, Calibration, CameraFormat, Shot, Size, White
 from slrig.model.capture import CaptureHeader
 from slrig.scan.acquisition import Recorder, capture_frames, exposed

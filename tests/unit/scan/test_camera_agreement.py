@@ -11,7 +11,7 @@ from slrig.errors import CalibrationError
 from slrig.model import Axis, Calibration, FloatArray, Pinhole
 from slrig.reconstruction import evaluate_redundancy, triangulate_camera_projector
 from slrig.reconstruction.identification import StripeEnsemble
-from slrig.scan.camera_agreement import Agreement, check_agreement, drop_contradicting_areas
+from slrig.scan.agreement import Agreement, check_agreement, drop_contradicting_areas
 from tests.unit.reconstruction.builders import CAMERA, OTHER_CAMERA, PROJECTOR, looking, seen_on_ball
 from tests.unit.reconstruction.test_redundancy import turned
 

@@ -23,10 +23,9 @@ from slrig.model import Axis, Black, CameraFormat, Capture, Gray, LineShift, Pat
 from slrig.model.capture import MAX_MISSING_BITS, trim_incomplete_codes
 from slrig.patterns.codes import gray_bits, gray_profile
 from slrig.patterns.sequence import scan_patterns
-from slrig.scan.decoding_only import decode_bundle
 from slrig.scan.plan import ReconstructionPlan
 from slrig.scan.preparation import sample_scan
-from slrig.scan.reconstruct import reconstruct_bundle
+from slrig.scan.reconstruct import decode_bundle, reconstruct_bundle
 
 
 def recorded(folder: Path, change: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None) -> Path:

@@ -10,7 +10,7 @@ import pytest
 from slrig.capture.frame_checks import Samples
 from slrig.errors import ConfigError
 from slrig.model import FloatArray
-from slrig.scan.exposure_proposal import Look, Proposal, SeenObject, proposal, seen_object
+from slrig.scan.exposure import Look, Proposal, SeenObject, proposal, seen_object
 
 FULL = 255
 DARK_DN, READ_DN, SLOPE = 6.0, 0.4, 0.05

@@ -43,9 +43,8 @@ from slrig.jobs.records import JobRecord, JobState, read_record, utc_now
 from slrig.jobs.resume import resume
 from slrig.model import Calibration
 from slrig.rig.session import ActiveCalibration, RigSession
-from slrig.scan.job import ScanJob, cancel_series, scans_of, series
+from slrig.scan.job import ScanJob, cancel_series, plan_from_json, scans_of, series
 from slrig.scan.plan import PatternPlan, ScanPlan, SeriesPlace, series_of
-from slrig.scan.records import plan_from_json
 from tests.unit.calibrate.calibration_bench import tame_calibration
 from tests.unit.scan.bench import Bench, failure_code
 from tests.unit.scan.fakes import WAIT_S, TameBench

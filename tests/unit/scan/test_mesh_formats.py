@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from slrig.errors import InvalidInputError, StorageError
 from slrig.model import Mesh, PointCurves, Refusal, Size
-from slrig.scan import mesh_formats
+from slrig.scan import formats as mesh_formats
 from slrig.scan.artefacts import (
     MESH,
     ON_REQUEST,
@@ -32,9 +32,15 @@ from slrig.scan.artefacts import (
     write_converted,
     write_report,
 )
-from slrig.scan.mesh_formats import encode_mesh_glb, encode_mesh_obj, encode_mesh_stl
-from slrig.scan.offered import MEDIA_TYPES
-from slrig.scan.view_format import coarse_mesh, encode_coarse_glb, encode_view_glb
+from slrig.scan.formats import (
+    MEDIA_TYPES,
+    coarse_mesh,
+    encode_coarse_glb,
+    encode_mesh_glb,
+    encode_mesh_obj,
+    encode_mesh_stl,
+    encode_view_glb,
+)
 
 ENCODERS: Mapping[str, Callable[[Mesh], bytes | bytearray]] = {
     "ply": encode_mesh_ply,

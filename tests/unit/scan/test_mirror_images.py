@@ -8,14 +8,14 @@ import pytest
 from slrig.meshing import SurfaceMesh
 from slrig.model import Axis, IntArray, Refusal, Size
 from slrig.reconstruction import SheetCurves
-from slrig.scan.mirror_images import (
+from slrig.scan.losses import (
     MirrorImages,
     mirror_image_notes,
     refuse_mirror_images,
     without_mirror_images,
     without_surface,
 )
-from slrig.scan.triangulated import Triangulated
+from slrig.scan.measured import Triangulated
 from tests.unit.meshing.test_initial import COLUMNS, ROWS, ridge
 from tests.unit.reconstruction.builders import CAMERA, PROJECTOR, looking
 from tests.unit.scan.test_triangulated import MANY, curves_in, seen, triangulate

@@ -9,9 +9,8 @@ from numba import config
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray, Mesh, Pinhole, Refusal, Size
-from slrig.scan import organised as module
-from slrig.scan.cloud_formats import encode_depth_tiff, encode_npz, encode_pcd
-from slrig.scan.organised import OrganisedCloud, organised
+from slrig.scan import clouds as module
+from slrig.scan.clouds import OrganisedCloud, encode_depth_tiff, encode_npz, encode_pcd, organised
 from slrig.scan.pictures import described_causes
 
 SIZE = Size(48, 40)

@@ -13,10 +13,20 @@ from numpy.typing import NDArray
 from slrig.errors import StorageError
 from slrig.kernels import in_bands
 from slrig.model import FloatArray, Mesh, Pinhole, Refusal, Size
-from slrig.scan import pictures, placing, shading
-from slrig.scan.pictures import _CAUSES, described_causes, encode_png, preview, rejection_picture
-from slrig.scan.placing import placed_vertices, resampled
-from slrig.scan.shading import Picture, resized
+from slrig.scan import pictures
+from slrig.scan import pictures as placing
+from slrig.scan import pictures as shading
+from slrig.scan.pictures import (
+    _CAUSES,
+    Picture,
+    described_causes,
+    encode_png,
+    placed_vertices,
+    preview,
+    rejection_picture,
+    resampled,
+    resized,
+)
 from tests.unit.scan.test_mesh_formats import only
 
 SIZE = Size(640, 480)

@@ -32,10 +32,19 @@ from slrig.model import (
     triangulated_axis,
 )
 from slrig.rig.session import RigFacts
-from slrig.scan.light_axis import FAIR_SHARE, chosen_axis, left_out_notes, played_axes, weakness
-from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
-from slrig.scan.plan_check import check_plan, pattern_sequence
-from slrig.scan.records import plan_from_json, plan_json
+from slrig.scan.job import plan_from_json, plan_json
+from slrig.scan.plan import (
+    FAIR_SHARE,
+    PatternPlan,
+    ReconstructionPlan,
+    ScanPlan,
+    check_plan,
+    chosen_axis,
+    left_out_notes,
+    pattern_sequence,
+    played_axes,
+    weakness,
+)
 from tests.unit.scan.fakes import TameCamera, TameProjector
 
 BOTH = tuple(Axis)

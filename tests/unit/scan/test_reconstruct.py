@@ -36,7 +36,7 @@ from slrig.errors import (
     ScanCancelledError,
     SlrigError,
 )
-from slrig.jobs.versions import versions
+from slrig.jobs.database import versions
 from slrig.model import (
     Axis,
     Black,

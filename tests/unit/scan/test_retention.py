@@ -15,9 +15,8 @@ from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.records import JobKind, JobState
 from slrig.jobs.store import JobStore
+from slrig.scan.job import READ_S, ScanLimits, ScanRetention, plan_json
 from slrig.scan.plan import ScanPlan
-from slrig.scan.records import plan_json
-from slrig.scan.retention import READ_S, ScanLimits, ScanRetention
 
 NOON = datetime(2026, 11, 23, 12, tzinfo=UTC)
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from slrig.model import Axis
-from slrig.scan.coverage import layered_share
-from slrig.scan.soundness import fault_notes, layer_notes, truth_notes
+from slrig.scan.artefacts import fault_notes, layer_notes, truth_notes
+from slrig.scan.reconstruct import layered_share
 from tests.unit.reconstruction.builders import CAMERA, PROJECTOR
 from tests.unit.scan.test_mirror_images import triangles_between
 from tests.unit.scan.test_triangulated import MANY, curves_in, seen, triangulate

@@ -12,10 +12,10 @@ from slrig.model import AlbedoMark, Axis, Calibration, FloatArray, Mesh, NoiseMo
 from slrig.reconstruction.identification import StripeEnsemble
 from slrig.reconstruction.pipeline import CameraCurves
 from slrig.reconstruction.triangulation import triangulate_camera_projector
-from slrig.scan.colouring import Coloured, albedo_report, coloured
-from slrig.scan.coverage import covered_share, with_uncovered_refused
+from slrig.scan.measured import Triangulated, triangulate_cameras, widest_gap_px
+from slrig.scan.pictures import Coloured, albedo_report, coloured
+from slrig.scan.reconstruct import covered_share, with_uncovered_refused
 from slrig.scan.stream import CameraResult
-from slrig.scan.triangulated import Triangulated, triangulate_cameras, widest_gap_px
 from tests.unit.reconstruction.builders import (
     CAMERA,
     OTHER_CAMERA,

@@ -12,7 +12,7 @@ import pytest
 from slrig.bundle import BundleFiles, open_bundle, write_bundle
 from slrig.capture.verifier import EvidenceSummary, check_capture
 from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, Shot, Sine, White
-from slrig.scan.usable_frames import UsableFiles, rebuilt_image, usable_files
+from slrig.scan.preparation import UsableFiles, rebuilt_image, usable_files
 from tests.unit.capture.fake_rig import PROJECTOR, Scene, patterns_for
 
 PATTERNS: tuple[Pattern, ...] = patterns_for(rows=True)

@@ -29,9 +29,8 @@ from slrig.errors import (
     WorkerLostError,
 )
 from slrig.jobs.database import Database
-from slrig.schedule.records import Cron, RunState, Schedule, ScheduledRun, ScheduleSpec, TaskKind
 from slrig.schedule.scheduler import LOOK_S, Scheduler
-from slrig.schedule.store import ScheduleStore
+from slrig.schedule.store import Cron, RunState, Schedule, ScheduledRun, ScheduleSpec, ScheduleStore, TaskKind
 from tests.samples import put_database
 from tests.unit.jobs.tame_manager import PowerCut
 from tests.unit.scan.fakes import WAIT_S

@@ -17,14 +17,10 @@ from slrig.config import NoticeKind, ServiceSettings, read_settings
 from slrig.errors import ConfigError, StorageError
 from slrig.failure import JobFailure
 from slrig.jobs.database import Database
-from slrig.jobs.outbox import Notice, Outbox
 from slrig.jobs.records import JobKind, JobRecord, JobState, acting_as
-from slrig.jobs.store import JobStore
-from slrig.schedule.notices import TOLD, NoticedHealth, tell_run
-from slrig.schedule.receivers import senders_of
-from slrig.schedule.records import Cron, RunState, Schedule, ScheduledRun, ScheduleSpec, TaskKind
-from slrig.schedule.sending import Sender
-from slrig.schedule.webhook import Webhook, signature, signing_key
+from slrig.jobs.store import JobStore, Notice, Outbox
+from slrig.schedule.notices import TOLD, NoticedHealth, Sender, Webhook, senders_of, signature, signing_key, tell_run
+from slrig.schedule.store import Cron, RunState, Schedule, ScheduledRun, ScheduleSpec, TaskKind
 from tests.samples import put_database
 from tests.unit.calibrate.health_bench import a_verification, hours
 from tests.unit.jobs.tame_manager import PowerCut
@@ -449,7 +445,7 @@ def test_thread_sends_what_waits_and_what_comes_and_ends_when_closed(bench: Benc
 def test_end_of_the_service_does_not_wait_for_a_receiver(
     bench: Bench, hook: Hook, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("slrig.schedule.sending._END_S", 0.01)
+    monkeypatch.setattr("slrig.schedule.notices._END_S", 0.01)
     HOW[how](hook)
     bench.sender = Webhook(bench.outbox, hook.url, KEY, timeout_s=WAIT_S)
     bench.sender.start()

@@ -11,8 +11,8 @@ from uuid import UUID
 
 import pytest
 
-from slrig.accept.asking import AcceptanceRequest
 from slrig.accept.job import AcceptanceTests
+from slrig.accept.plan import AcceptanceRequest
 from slrig.calibrate.verification import HealthStore, RigHealth
 from slrig.errors import (
     CalibrationError,
@@ -27,8 +27,8 @@ from slrig.errors import (
 )
 from slrig.failure import JobFailure, error_of
 from slrig.jobs.records import Holder, JobKind, JobState
-from slrig.schedule.records import Cron, RunState, Schedule, ScheduledRun, ScheduleSpec, TaskKind
-from slrig.schedule.tasks import Tasks
+from slrig.schedule.scheduler import Tasks
+from slrig.schedule.store import Cron, RunState, Schedule, ScheduledRun, ScheduleSpec, TaskKind
 from tests.unit.accept.test_job import PLAN, Desk, desk, desks
 from tests.unit.calibrate.calibration_bench import CalibrationBench
 from tests.unit.calibrate.health_bench import a_verification
@@ -174,7 +174,7 @@ def test_calibration_takes_every_pose_solves_and_is_used_only_if_ordered(bench: 
 
 def test_calibration_that_is_not_to_be_used_is_not_activated(bench: TaskBench, monkeypatch: pytest.MonkeyPatch) -> None:
     bad = {"verdict": {"grade": "do_not_use", "summary": "do not use: 9 px", "unattended": ["it is bad"]}}
-    monkeypatch.setattr("slrig.calibrate.pose_judging.summary", lambda _: bad)
+    monkeypatch.setattr("slrig.calibrate.report.summary", lambda _: bad)
     told = bench.do(TaskKind.CALIBRATION, board=BOARD, activate=True)
     assert (told["activated"], told["verdict"]) == (False, "do not use: 9 px")
     assert told["left_to_a_person"] == ["it is bad"]

@@ -13,7 +13,7 @@ from simulated_rig import shapes
 from simulated_rig.device import SimulatedHead
 from simulated_rig.scene import build_surface, read_scene
 from slrig.model import FloatArray, IntArray
-from slrig.scan.mesh_formats import encode_mesh_glb
+from slrig.scan.formats import encode_mesh_glb
 from tests.unit.scan.test_mesh_formats import half_ball
 from tests.unit.simulated_rig.building import FACING_PLATE, small_head
 

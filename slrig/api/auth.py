@@ -1,0 +1,699 @@
+"""Keys, sessions, scopes and limits of requests, security headers; and the record of each writing request."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import re
+import secrets
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Annotated, Literal
+from urllib.parse import urlsplit
+
+import structlog
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import RedirectResponse
+from filelock import FileLock
+from pydantic import AwareDatetime, BaseModel, Field, TypeAdapter, ValidationError
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.middleware.body_limit import RequestBodyLimitMiddleware
+from starlette.requests import cookie_parser
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from slrig import KEY_VARIABLE
+from slrig.api.calibration import IMPORT_PATH
+from slrig.api.problems import answer, problem, problems
+from slrig.api.scopes import READING, KeyScope, moves, needed_scope
+from slrig.api.system import FILES_PATH
+from slrig.bundle import Strict, write_file
+from slrig.errors import ConfigError, StorageError
+from slrig.failure import disk_errors
+from slrig.jobs.records import Clock, acting_as, utc_now
+from slrig.jobs.store import Audit
+
+LEAST_KEY_LENGTH = 16
+"""A key that people made up and that is shorter than this can be guessed."""
+
+FIRST_NAME = "owner"
+"""Whom the key belongs to that the service makes at its first start."""
+
+GIVEN_NAME = "environment"
+"""Whom the key of the environment belongs to."""
+
+KEY_NAME = r"^[A-Za-z0-9][A-Za-z0-9 ._@-]{0,63}$"
+
+
+ALL_SCOPES = tuple(KeyScope)
+
+
+class Key(Strict):
+    """One key: the name of who has it, its digest, what it is for. It ends at `expires_at`, or when it is revoked."""
+
+    name: Annotated[str, Field(pattern=KEY_NAME)]
+    digest: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    scopes: Annotated[tuple[KeyScope, ...], Field(strict=False)]
+    created_at: Annotated[AwareDatetime, Field(strict=False)]
+    expires_at: Annotated[AwareDatetime, Field(strict=False)] | None = None
+    revoked_at: Annotated[AwareDatetime, Field(strict=False)] | None = None
+
+    def fault(self, now: datetime) -> str | None:
+        """Why the key opens nothing, None where it does."""
+        if self.revoked_at is not None:
+            return f"was revoked on {self.revoked_at:%Y-%m-%d}"
+        if self.expires_at is not None and self.expires_at <= now:
+            return f"expired on {self.expires_at:%Y-%m-%d}"
+        return None
+
+
+class _KeyFile(Strict):
+    format: Literal["slrig-keys"]
+    version: Literal[1]
+    keys: Annotated[tuple[Key, ...], Field(strict=False)]
+
+
+_adapter = TypeAdapter(_KeyFile)
+
+
+def digest(key: str) -> str:
+    """What is kept of a key."""
+    return hashlib.sha256(key.encode()).hexdigest()
+
+
+class KeyRing:
+    """The keys in a file, and the one of the environment beside them, which is kept nowhere.
+
+    Raises
+    ------
+    ConfigError
+        The given key is too short or cannot travel in a header.
+    StorageError
+        Here and in every call: the file cannot be read or written, or somebody changed it into something else.
+    """
+
+    def __init__(self, path: Path, *, given: str | None = None, clock: Clock = utc_now) -> None:
+        self._path = path
+        self._clock = clock
+        self._given = None if given is None else _given_key(given, clock())
+        self._seen: tuple[int, int, int] | None = None
+        self._by_digest: dict[str, Key] = {}
+        self._look()
+
+    def find(self, sent: str) -> Key | None:
+        """The key that somebody sent, if it is one, whether or not it still opens anything."""
+        self._look()
+        return self._by_digest.get(digest(sent))
+
+    def named(self, name: str) -> Key | None:
+        """The newest key of a name."""
+        return next((key for key in reversed(self.everybody) if key.name == name), None)
+
+    @property
+    def everybody(self) -> tuple[Key, ...]:
+        """Every key, from old to new."""
+        self._look()
+        return tuple(self._by_digest.values())
+
+    def add(self, name: str, scopes: Iterable[KeyScope], *, life: timedelta | None = None) -> str:
+        """Make a key and return it: this is the only time that it is seen. Raises ConfigError: the name is taken, or is
+        none.
+        """
+        if not re.fullmatch(KEY_NAME, name):
+            message = (
+                f"{name!r} is no name for a key: expected up to 64 letters, digits, spaces and any of "
+                "'._@-', the first a letter or a digit. Name the person or the program that gets it."
+            )
+            raise ConfigError(message)
+        key = secrets.token_urlsafe(32)
+        now = self._clock()
+        made = Key(
+            name=name,
+            digest=digest(key),
+            scopes=tuple(each for each in KeyScope if each in {KeyScope.LOOK, *scopes}),
+            created_at=now,
+            expires_at=None if life is None else now + life,
+        )
+        with self._changing() as keys:
+            if any(each.name == name and each.fault(now) is None for each in keys) or name == GIVEN_NAME:
+                message = f"There is a key of the name '{name}' already. Revoke it first, or choose another name."
+                raise ConfigError(message)
+            keys.append(made)
+        return key
+
+    def revoke(self, name: str) -> None:
+        """Have the key of a name open nothing any more. Raises ConfigError: there is none."""
+        now = self._clock()
+        with self._changing() as keys:
+            found = [place for place, key in enumerate(keys) if key.name == name and key.fault(now) is None]
+            if not found:
+                known = ", ".join(sorted(key.name for key in keys if key.fault(now) is None)) or "none at all"
+                message = f"There is no key of the name '{name}' that could be revoked, but {known}."
+                raise ConfigError(message)
+            keys[found[0]] = keys[found[0]].model_copy(update={"revoked_at": now})
+
+    @contextmanager
+    def _changing(self) -> Iterator[list[Key]]:
+        with disk_errors(self._path.parent), FileLock(self._path.with_suffix(".lock"), mode=0o600):
+            keys = list(self._read())
+            yield keys
+            file = _KeyFile(format="slrig-keys", version=1, keys=tuple(keys))
+            write_file(self._path, _adapter.dump_json(file, indent=1) + b"\n")
+            self._path.chmod(0o600)
+
+    def _look(self) -> None:
+        try:
+            found = self._path.stat()
+        except FileNotFoundError:
+            seen = (0, 0, 0)
+        except OSError as error:
+            message = f"The keys in {self._path} cannot be read: {error.strerror}. See that slrig may read the file."
+            raise StorageError(message) from error
+        else:
+            seen = (found.st_mtime_ns, found.st_ino, found.st_size)
+        if seen == self._seen:
+            return
+        keys = self._read()
+        self._by_digest = {key.digest: key for key in (*keys, *([] if self._given is None else [self._given]))}
+        self._seen = seen
+
+    def _read(self) -> tuple[Key, ...]:
+        try:
+            return _adapter.validate_json(self._path.read_bytes()).keys
+        except FileNotFoundError:
+            return ()
+        except (OSError, ValidationError) as error:
+            message = (
+                f"The keys in {self._path} cannot be read: {_first_line(error)}. Restore the file from a "
+                "backup, or remove it and make the keys anew with `slrig key add`."
+            )
+            raise StorageError(message) from error
+
+
+def _first_line(error: OSError | ValidationError) -> str:
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    first = error.errors()[0]
+    return f"{'.'.join(map(str, first['loc'])) or 'file'}: {first['msg']}"
+
+
+def _given_key(given: str, now: datetime) -> Key:
+    sendable = given.isascii() and given.isprintable()
+    if len(given) < LEAST_KEY_LENGTH or not sendable:
+        others = "" if sendable else ", and others among them"
+        message = (
+            f"{KEY_VARIABLE}: expected a key of {LEAST_KEY_LENGTH} or more printable ASCII characters, found "
+            f"{len(given)}{others}. Unset it, and the service makes a key of its own."
+        )
+        raise ConfigError(message)
+    return Key(name=GIVEN_NAME, digest=digest(given), scopes=ALL_SCOPES, created_at=now)
+
+
+def first_key(ring: KeyRing, *, fresh: bool) -> str | None:
+    """The key that a service makes at its start, to be shown once: where there is none, or a `fresh` one is asked for,
+    which takes the place of the one made so before. None where none is made.
+    """
+    if fresh:
+        owner = ring.named(FIRST_NAME)
+        if owner is not None and owner.revoked_at is None:
+            ring.revoke(FIRST_NAME)
+    elif ring.everybody:
+        return None
+    return ring.add(FIRST_NAME, ALL_SCOPES)
+
+
+LINK_PATH = "/session/link"
+SESSION_LIFE = timedelta(hours=12)
+"""A working day."""
+LINK_LIFE = timedelta(minutes=15)
+MOST_SESSIONS = 256
+"""The oldest goes when there are more."""
+
+router = APIRouter(prefix="/session", tags=["session"])
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One browser that is logged in: by whose key, and until when. ends : what is left when that key ends."""
+
+    name: str
+    expires_at: datetime
+
+
+class Sessions:
+    """Who is logged in. Lives on the event loop's thread, but for `link`, which is made before the loop runs."""
+
+    def __init__(self, ring: KeyRing, *, cookie: str, clock: Clock = utc_now) -> None:
+        self.ring = ring
+        # Cookies do not tell ports apart: two services of one machine need two names.
+        self.cookie = cookie
+        self._clock = clock
+        self._open: OrderedDict[str, Session] = OrderedDict()
+        self._links: dict[str, Session] = {}
+
+    def link(self, name: str) -> str:
+        """A secret that opens one session by the key of a name."""
+        secret = secrets.token_urlsafe(32)
+        self._links[digest(secret)] = Session(name, self._clock() + LINK_LIFE)
+        return secret
+
+    def follow(self, secret: str) -> tuple[str, Session] | None:
+        """Open the session of a link, once; None where it was followed before, or is too old."""
+        link = self._links.pop(digest(secret), None)
+        return None if link is None or link.expires_at <= self._clock() else self.open(link.name)
+
+    def open(self, name: str) -> tuple[str, Session]:
+        """Open a session by the key of a name: the secret for the cookie, and what it stands for."""
+        secret = secrets.token_urlsafe(32)
+        session = Session(name, self._clock() + SESSION_LIFE)
+        self._open[digest(secret)] = session
+        while len(self._open) > MOST_SESSIONS:
+            self._open.popitem(last=False)
+        return secret, session
+
+    def find(self, secret: str) -> Session | None:
+        """The session that a cookie stands for."""
+        found = self._open.get(digest(secret))
+        return found if found is not None and found.expires_at > self._clock() else None
+
+    def close(self, secret: str) -> None:
+        """Log out. Idempotent."""
+        self._open.pop(digest(secret), None)
+
+
+class SessionBody(BaseModel):
+    """Whom the service takes the sender for, what that name may do, and until when; null is without end."""
+
+    name: str
+    scopes: tuple[KeyScope, ...]
+    expires_at: datetime | None
+
+
+@router.get("")
+async def look_at_session(request: Request) -> SessionBody:
+    """Return whom the service takes you for."""
+    caller = request.state.caller
+    return SessionBody(name=caller.name, scopes=caller.scopes, expires_at=caller.expires_at)
+
+
+@router.post("", status_code=201)
+async def open_session(request: Request, response: Response) -> SessionBody:
+    """Log a browser in: send the key in a header, as always, and go on with the cookie that comes back."""
+    caller = request.state.caller
+    sessions: Sessions | None = request.app.state.sessions
+    if sessions is None:
+        raise HTTPException(409, "This service asks nobody for a key, so there is nothing to log in to.")
+    secret, session = sessions.open(caller.name)
+    _set_cookie(request, response, sessions, secret)
+    return SessionBody(name=caller.name, scopes=caller.scopes, expires_at=session.expires_at)
+
+
+@router.delete("", status_code=204)
+async def close_session(request: Request, response: Response) -> None:
+    """Log a browser out."""
+    sessions: Sessions | None = request.app.state.sessions
+    if sessions is not None:
+        sessions.close(request.cookies.get(sessions.cookie, ""))
+        response.delete_cookie(sessions.cookie, path="/", httponly=True, samesite="strict")
+
+
+@router.get(
+    "/link",
+    response_class=Response,
+    status_code=303,
+    responses={303: {"description": "logged in; on to the page of the service"}, **problems(401)},
+    openapi_extra={"security": []},
+)
+async def follow_link(request: Request, token: Annotated[str, Query(max_length=200)]) -> Response:
+    """Log a browser in by the link that `slrig serve` prints. It works once, for a quarter of an hour."""
+    sessions: Sessions | None = request.app.state.sessions
+    opened = None if sessions is None else sessions.follow(token)
+    if sessions is None or opened is None:
+        message = (
+            "This link was followed before, or is older than a quarter of an hour. Send your key in a header to POST "
+            "/session, or start the service again for a new link."
+        )
+        raise HTTPException(401, message)
+    response = RedirectResponse("/", 303)
+    _set_cookie(request, response, sessions, opened[0])
+    return response
+
+
+def _set_cookie(request: Request, response: Response, sessions: Sessions, secret: str) -> None:
+    response.set_cookie(
+        sessions.cookie,
+        secret,
+        max_age=round(SESSION_LIFE.total_seconds()),
+        path="/",
+        httponly=True,
+        samesite="strict",
+        # Behind a proxy the browser's own connection is encrypted, and its Origin says so.
+        secure=request.url.scheme == "https" or request.headers.get("origin", "").startswith("https:"),
+    )
+
+
+OPEN_PATHS = frozenset({"/", "/livez", "/readyz", LINK_PATH})
+"""What answers without a key: the page, which asks for one, probes, which tell nothing about scans, and the link that
+stands for a key."""
+
+ANYONE = "anyone"
+"""Who sends requests to a service that asks for no key."""
+
+_NAVIGATED = "navigate"
+_JSON_TYPES = frozenset({"application/json", "application/problem+json"})
+_BURST_S = 4.0
+"""How many seconds' worth of requests may come at once: a page with its pictures."""
+_MOST_COUNTED = 1024
+_LOOK_AGAIN_S = 10.0
+"""How long a stream may go on that was begun with a key that has been revoked, or has expired, since then."""
+
+_log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """Who sent a request, what their key is for, and until when it, or their session, is good."""
+
+    name: str
+    scopes: tuple[KeyScope, ...] = ALL_SCOPES
+    expires_at: datetime | None = None
+
+
+class Access:
+    """Middleware that lets a request pass by the key or the session that comes with it.
+
+    ring, sessions : None lets everybody pass. per_second : how many requests of one name, or from one address without a
+    key, are answered.
+    """
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        *,
+        ring: KeyRing | None,
+        sessions: Sessions | None,
+        audit: Audit,
+        per_second: float,
+    ) -> None:
+        self._app = app
+        self._ring = ring
+        self._sessions = sessions
+        self._audit = audit
+        self._rates = Rates(per_second)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request, or refuse it."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers, method, path = Headers(scope=scope), scope["method"], scope["path"]
+        address = (scope.get("client") or ("",))[0]
+        caller: Caller | None = None
+        try:
+            by_key = _sent_key(headers) is not None
+            refuse_foreign_page(headers, method, path, by_cookie=not by_key and "cookie" in headers)
+            refuse_other_types(headers, method, path)
+            caller = self._caller(headers, path)
+            self._rates.count(address if caller is None else caller.name)
+            if caller is not None:
+                refuse_out_of_scope(caller, needed_scope(method, path))
+        except Refused as refusal:
+            await self._refuse(refusal, address, caller, method, path, scope, receive, send)
+            return
+        scope.setdefault("state", {})["caller"] = caller
+        status, made, is_stream, looked_s, is_over = 0, "", False, time.monotonic(), False
+
+        async def noted(message: Message) -> None:
+            nonlocal status, made, is_stream, looked_s, is_over
+            if message["type"] == "http.response.start":
+                kept = Headers(raw=message.get("headers", []))
+                status, made, is_stream = message["status"], kept.get("location", ""), "content-length" not in kept
+            elif is_stream and message.get("more_body") and time.monotonic() >= looked_s + _LOOK_AGAIN_S:
+                looked_s = time.monotonic()
+                try:
+                    self._caller(headers, path)
+                except Refused as refusal:
+                    is_over = True
+                    # To whoever makes the stream it is as if the client had gone.
+                    raise ConnectionAbortedError(str(refusal)) from refusal
+            await send(message)
+
+        name = ANYONE if caller is None else caller.name
+        try:
+            with acting_as(name):
+                await self._app(scope, receive, noted)
+        except Exception:
+            if not is_over:
+                raise
+            await send({"type": "http.response.body", "body": b"", "more_body": False})
+        if method not in READING or path == LINK_PATH:
+            await self._note(name, address, method, path, status, made)
+
+    def _caller(self, headers: Headers, path: str) -> Caller | None:
+        """Who sends a request; None for what needs no key."""
+        if self._ring is None or self._sessions is None:
+            return Caller(ANYONE)
+        if path in OPEN_PATHS or path.startswith(f"{FILES_PATH}/"):
+            return None
+        try:
+            return self._known(self._ring, self._sessions, headers)
+        except StorageError as error:
+            # A stranger is not told where the file lies.
+            _log.error("keys cannot be read", error=str(error))
+            detail = "The service cannot read its keys, and lets nobody in. Its log says what to do."
+            raise Refused(507, error.code, detail) from error
+
+    def _known(self, ring: KeyRing, sessions: Sessions, headers: Headers) -> Caller:
+        sent = _sent_key(headers)
+        if sent is not None:
+            return _let_in(ring.find(sent))
+        cookie = cookie_parser(headers.get("cookie", "")).get(sessions.cookie)
+        session = None if cookie is None else sessions.find(cookie)
+        if session is not None:
+            owner = _let_in(ring.named(session.name))
+            return Caller(owner.name, owner.scopes, session.expires_at)
+        raise _unauthorized("none" if cookie is None else "a session that is over")
+
+    async def _refuse(
+        self,
+        refusal: Refused,
+        address: str,
+        caller: Caller | None,
+        method: str,
+        path: str,
+        scope: Scope,
+        receive: Receive,
+        send: Send,
+    ) -> None:
+        if refusal.status == 401:
+            # Strangers are not put on record: they could fill the disk with it.
+            try:
+                self._rates.count(address)
+            except Refused as too_many:
+                refusal = too_many
+        elif caller is not None:
+            await self._note(caller.name, address, method, path, refusal.status, "")
+        response = answer(problem(refusal.status, refusal.code, str(refusal)), headers=refusal.headers)
+        await response(scope, receive, send)
+
+    async def _note(self, name: str, address: str, method: str, path: str, status: int, made: str) -> None:
+        try:
+            await run_in_threadpool(self._audit.note, name, address, method, path, status, made)
+        except StorageError as error:
+            # What was done is done: the answer stands.
+            _log.warning("not put on record", who=name, method=method, path=path, status=status, error=str(error))
+
+
+class Refused(Exception):  # noqa: N818 - an answer, not a fault of ours
+    """A request that goes no further."""
+
+    def __init__(self, status: int, code: str, detail: str, headers: dict[str, str] | None = None) -> None:
+        super().__init__(detail)
+        self.status, self.code, self.headers = status, code, headers
+
+
+def refuse_foreign_page(headers: Headers, method: str, path: str, *, by_cookie: bool) -> None:
+    """Refuse what another site's page, or another service's of this machine, has a browser send.
+
+    Browsers say where a request comes from: in Sec-Fetch-Site (W3C Fetch Metadata), where the address is this machine
+    or encrypted, and in Origin with all that writes. A page cannot change either. A link that somebody follows may come
+    from anywhere, if it moves nothing. Programs send neither header. A picture that moves light, by cookie and without
+    either, must say in Referer that it is on a page of ours. Raises Refused.
+    """
+    site, host = headers.get("sec-fetch-site"), headers.get("host", "").lower()
+    if site is not None:
+        foreign = site not in {"same-origin", "none"}
+    elif "origin" in headers:
+        foreign = _authority(headers["origin"]) != host
+    else:
+        foreign = by_cookie and moves(method, path) and _authority(headers.get("referer", "")) != host
+    if not foreign or (headers.get("sec-fetch-mode") == _NAVIGATED and not moves(method, path)):
+        return
+    where = headers.get("origin") or headers.get("referer") or "another site"
+    detail = (
+        f"This request was sent by a page of {where}, and the service takes requests of its own pages and of programs "
+        "only. Open the service's own address in the browser, or send the request from a program."
+    )
+    raise Refused(403, "foreign-page", detail)
+
+
+def refuse_other_types(headers: Headers, method: str, path: str) -> None:
+    """Refuse a body that a form of any page could send: what is no JSON, and no file to import. Raises Refused."""
+    kind = headers.get("content-type", "").partition(";")[0].strip().lower()
+    has_body = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
+    if method in READING or path == IMPORT_PATH or kind in _JSON_TYPES or not (kind or has_body):
+        return
+    found = f"'{kind}'" if kind else "none"
+    raise Refused(415, "unsupported-media-type", f"Content-Type: expected application/json, found {found}.")
+
+
+def _authority(url: str) -> str:
+    try:
+        return urlsplit(url).netloc.lower()
+    except ValueError:
+        return ""
+
+
+def _let_in(key: Key | None) -> Caller:
+    if key is None:
+        raise _unauthorized("another one")
+    fault = key.fault(utc_now())
+    if fault is not None:
+        raise _unauthorized(f"one that {fault}")
+    return Caller(key.name, key.scopes, key.expires_at)
+
+
+def _unauthorized(found: str) -> Refused:
+    detail = (
+        f"This service needs an API key, and the request has {found}. Send yours as 'Authorization: Bearer KEY' or "
+        "'X-API-Key: KEY'. Whoever runs the service makes one with `slrig key add NAME`."
+    )
+    return Refused(401, "unauthorized", detail, {"WWW-Authenticate": "Bearer"})
+
+
+def refuse_out_of_scope(caller: Caller, needed: KeyScope) -> None:
+    """Refuse what a key is not for. Raises Refused."""
+    if needed in caller.scopes:
+        return
+    detail = (
+        f"The key of '{caller.name}' is for {', '.join(caller.scopes)}, and this takes one to {needed}. Ask "
+        f"whoever runs the service for it: `slrig key add NAME --scope {needed}`."
+    )
+    raise Refused(403, "scope", detail)
+
+
+def _sent_key(headers: Headers) -> str | None:
+    scheme, _, token = headers.get("authorization", "").partition(" ")
+    if scheme.lower() == "bearer" and token.strip():
+        return token.strip()
+    return headers.get("x-api-key")
+
+
+class Rates:
+    """How many requests each name may send: so many a second, and a few seconds' worth at once (a token bucket).
+
+    >>> rates = Rates(1, clock=lambda: 0.0)
+    >>> for _ in range(4): rates.count("ann")
+    >>> rates.count("ann")
+    Traceback (most recent call last):
+    ...
+    slrig.api.auth.Refused: 'ann' sends more than 1 requests a second. Wait a second, then send fewer.
+    >>> rates.count("bob")
+    """
+
+    def __init__(self, per_second: float, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._per_second = per_second
+        self._clock = clock
+        self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
+
+    def count(self, name: str) -> None:
+        """Count one request. Raises Refused: it is one too many."""
+        now = self._clock()
+        most = max(self._per_second * _BURST_S, 1.0)
+        left, since = self._left.pop(name, (most, now))
+        left = min(left + (now - since) * self._per_second, most)
+        allowed = left >= 1.0
+        self._left[name] = (left - 1.0 if allowed else left, now)
+        if len(self._left) > _MOST_COUNTED:
+            self._left.popitem(last=False)
+        if not allowed:
+            detail = f"'{name}' sends more than {self._per_second:g} requests a second. Wait a second, then send fewer."
+            raise Refused(429, "too-many-requests", detail, {"Retry-After": "1"})
+
+
+LOCAL_NAMES = ("localhost", "127.0.0.1", "[::1]")
+
+_TOO_LONG = 413
+_PASS_OVER_S = 1.0
+"""A body of 100 MB is here by then on a usual network; who sends more, or slowly, may find the connection reset."""
+
+_HEADERS = {
+    # What is sent as a picture or as text is never run.
+    "X-Content-Type-Options": "nosniff",
+    # Our pages load from here alone, and nobody frames them.
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; style-src 'self' 'unsafe-inline'; "
+    "object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'",
+    "X-Frame-Options": "DENY",
+    # No other site's page shows our pictures, holds our window, or is told which page a link was on.
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Referrer-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+
+
+class SecurityHeaders:
+    """Middleware that adds them, where an answer says nothing of its own."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                # A report has a stricter policy of its own.
+                for name, value in _HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        await self._app(scope, receive, with_headers if scope["type"] == "http" else send)
+
+
+class BodyLimits:
+    """Middleware: how long a body may be. `most_bytes` holds for every path but those of `longer`."""
+
+    def __init__(self, app: ASGIApp, *, most_bytes: int, longer: Mapping[str, int]) -> None:
+        self._usual = RequestBodyLimitMiddleware(app, max_body_size=most_bytes)
+        self._longer = {path: RequestBodyLimitMiddleware(app, max_body_size=most) for path, most in longer.items()}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        limited = self._longer.get(scope["path"], self._usual) if scope["type"] == "http" else self._usual
+
+        async def after_the_body(message: Message) -> None:
+            if message["type"] == "http.response.start" and message["status"] == _TOO_LONG:
+                await _pass_over(scope, receive)
+            await send(message)
+
+        await limited(scope, receive, after_the_body)
+
+
+async def _pass_over(scope: Scope, receive: Receive) -> None:
+    """Take what a client is still sending, for a moment: a connection that is closed with bytes unread is reset, and
+    a proxy then loses the answer. One that waits to be told to send has sent nothing.
+    """
+    if any(name == b"expect" for name, _ in scope["headers"]):
+        return
+    with suppress(TimeoutError):
+        async with asyncio.timeout(_PASS_OVER_S):
+            while (await receive()).get("more_body", False):
+                pass

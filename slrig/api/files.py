@@ -1,0 +1,412 @@
+"""The files of a scan: mesh, points, report, pictures, clouds made on request, and the bundle as one zip."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+import zipfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext, suppress
+from pathlib import Path
+from typing import Annotated, Any
+from uuid import UUID
+
+from fastapi import APIRouter, Header, Response
+from fastapi import Path as PathParameter
+from fastapi.responses import FileResponse, StreamingResponse
+
+from slrig.api.problems import BYTES, file_of
+from slrig.api.service import Service, Serving
+from slrig.bundle import CALIBRATION, CAMERA_NAME, DESCRIPTION, write_file
+from slrig.errors import ArtefactNotReadyError, InvalidInputError, JobNotFoundError, StorageError, WorkerBusyError
+from slrig.jobs.data_folder import BUNDLE, DataFolder
+from slrig.jobs.records import JobKind, JobRecord, JobState
+from slrig.jobs.worker import Task
+from slrig.scan.artefacts import MESH, ON_REQUEST, REPORT, converted, write_converted
+from slrig.scan.formats import (
+    BUNDLE_ZIP,
+    CALIBRATION_USED,
+    MEDIA_TYPES,
+    agreement_picture,
+    causes_picture,
+    missing_for,
+    rejected_picture,
+    requested_forms,
+)
+from slrig.scan.job import cloud_bytes
+
+LONGEST_WAIT_S = 30.0
+"""From when on a request that waits for the worker is told to come again: clients wait a minute for an answer."""
+
+MOST_WAITING = 8
+"""Requests that may wait for the worker: each holds one of the forty threads that answer."""
+
+# A cloud takes the worker half a second and some hundred megabytes: one at a time, whoever asks.
+_making = threading.Lock()
+_places = threading.BoundedSemaphore(MOST_WAITING)
+
+
+def clouds_of(folder: DataFolder, scan: Path, names: Iterable[str]) -> set[str]:
+    """Names of the files that can be made of a finished scan on request, here. names : of its files."""
+    given = set(names)
+    prefix, suffix = causes_picture("/").split("/")
+    cameras = [name.removeprefix(prefix).removesuffix(suffix) for name in given if name.startswith(prefix)]
+    forms = [form for form in requested_forms() if missing_for(form) is None]
+    of_cameras = [form for form in forms if "{camera}" in form]
+    sources = [camera for camera in cameras if has_sources(folder, scan, camera)]
+    found = {form.format(camera=camera) for camera in sources for form in of_cameras}
+    if cameras and has_sources(folder, scan, None):
+        found.update(form for form in forms if "{camera}" not in form)
+    return found
+
+
+def has_sources(folder: DataFolder, scan: Path, camera: str | None) -> bool:
+    """True if the sources of a camera's cloud exist; None: those of a file of all cameras, except maps of causes."""
+    further = f"{BUNDLE}/{DESCRIPTION}" if camera is None else causes_picture(camera)
+    sources = MESH, REPORT, further, f"{BUNDLE}/{CALIBRATION}"
+    return all(folder.owns(scan / source) for source in sources)
+
+
+def make_cloud(service: Service, scan_id: UUID, form: str, camera: str | None) -> None:
+    """Make one of `requested_forms` of a finished scan in the worker, and keep it, unless it exists.
+
+    Raises
+    ------
+    WorkerBusyError
+        It was not its turn for too long, or too many wait.
+    ExtraMissingError
+        The format takes a library that is not installed.
+    InvalidInputError, NothingToReconstructError
+        A file of the scan is not as slrig wrote it, or the camera sees nothing of the mesh.
+    JobNotFoundError
+        The scan was deleted meanwhile.
+    StorageError
+        The disk refused.
+    WorkerLostError, OutOfMemoryError
+        It came to nothing.
+    """
+    place = service.folder.scan(scan_id)
+    path = place / form.format(camera=camera)
+    until_s = time.monotonic() + LONGEST_WAIT_S
+    if not _places.acquire(blocking=False):
+        message = f"{MOST_WAITING} requests wait for the worker already. Ask again for {path.name}."
+        raise WorkerBusyError(message)
+    try:
+        if not _making.acquire(timeout=LONGEST_WAIT_S):
+            message = f"Another file is made first, and {path.name} has to wait for it. Ask again."
+            raise WorkerBusyError(message)
+        try:
+            if os.path.lexists(path):
+                return
+            task = Task(cloud_bytes, (place, form, camera), what=f"making of {path.name}", remedy="Ask again.")
+            data = service.worker.run(task, within_s=max(until_s - time.monotonic(), 0.0))
+            # From here, not by the worker: where that is killed nothing is left half written.
+            service.folder.require_space(len(data) + service.settings.min_free_bytes)
+            write_file(path, data)
+        finally:
+            _making.release()
+    except (InvalidInputError, StorageError) as error:
+        if service.folder.owns(place):
+            raise
+        message = f"Scan {scan_id} was deleted while {path.name} was made of it."
+        raise JobNotFoundError(message) from error
+    finally:
+        _places.release()
+
+
+# A conversion takes a second and some hundred megabytes: one at a time, whoever asks.
+_converting = threading.Lock()
+
+_CHUNK_BYTES = 2**20
+_ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
+
+router = APIRouter(prefix="/scan/{scan_id}", tags=["files"])
+
+Camera = Annotated[str, PathParameter(pattern=CAMERA_NAME)]
+KnownTag = Annotated[str | None, Header(alias="If-None-Match", description="an ETag; 304 if it still holds")]
+
+
+def ready_files(folder: DataFolder, record: JobRecord) -> dict[str, str]:
+    """Name to URL path of each file of a scan that can be fetched now."""
+    if record.state is JobState.COMPUTING:
+        names = set().union(*map(_known_files, folder.places(record.id)))
+    elif record.state.final and folder.owns(folder.scan(record.id)):
+        names = _known_files(folder.scan(record.id))
+        names |= clouds_of(folder, folder.scan(record.id), names)
+        if folder.owns(folder.scan(record.id) / BUNDLE):
+            names.add(BUNDLE_ZIP)
+    else:
+        return {}
+    if MESH in names:
+        names |= set(ON_REQUEST)
+        if record.state.final and folder.owns(folder.scan(record.id) / BUNDLE / CALIBRATION):
+            names.add(CALIBRATION_USED)
+    return {name: f"/scan/{record.id}/{name}" for name in sorted(names)}
+
+
+def _known_files(place: Path) -> set[str]:
+    try:
+        known = [path for path in place.iterdir() if path.name in MEDIA_TYPES or path.suffix == ".png"]
+    except FileNotFoundError:
+        return set()
+    return {path.name for path in known if not path.is_symlink()}
+
+
+def refuse_absent(record: JobRecord, name: str) -> None:
+    """Raise ArtefactNotReadyError, which says why a scan or a model has no such file, or not yet."""
+    kind, here = record.kind, f"/{record.kind}/{record.id}"
+    if not record.state.final:
+        message = (
+            f"{name} of {kind} {record.id} is not ready: the {kind} is {record.state}. "
+            f"Follow {here}/events until it is over."
+        )
+    elif record.state is JobState.SUCCEEDED:
+        message = f"{kind.capitalize()} {record.id} has no file {name}. GET {here} names those it has."
+    else:
+        why = "" if record.fault is None else f" ({record.fault.message})"
+        again = "Scan again." if kind is JobKind.SCAN else "Make it again."
+        message = f"{kind.capitalize()} {record.id} was {record.state}, so {name} will never be made{why}. {again}"
+    raise ArtefactNotReadyError(message)
+
+
+def _file(service: Service, scan_id: UUID, name: str, media_type: str, known: str | None) -> Response:
+    place = service.folder.scan(scan_id)
+    path = place / name
+    is_made = name in ON_REQUEST and not os.path.lexists(path)
+    with _converting if is_made else nullcontext():
+        # Looked up now: while others waited for their conversion the scan may have ended, and then this one is kept.
+        record = service.store.get(scan_id, JobKind.SCAN)
+        service.scan_retention.reading(scan_id)
+        if is_made and record.state.final and service.folder.owns(place / MESH) and not os.path.lexists(path):
+            write_converted(place, name)
+        made = _made_so_far(service.folder, record, name)
+    if made is None and not (record.state.final and service.folder.owns(path)):
+        refuse_absent(record, path.name)
+    headers = _headers(scan_id, name)
+    if _still_known(known, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    if made is not None:
+        headers["Content-Disposition"] = f'inline; filename="{path.name}"'
+        return Response(made, media_type=media_type, headers=headers)
+    return _kept(path, media_type, headers)
+
+
+def kept_file(path: Path, media_type: str, job_id: UUID, known: str | None) -> Response:
+    """A file that never changes, of a job that is over; 304 where the client knows it."""
+    headers = _headers(job_id, path.name)
+    return (
+        Response(status_code=304, headers=headers)
+        if _still_known(known, headers["ETag"])
+        else _kept(path, media_type, headers)
+    )
+
+
+def _kept(path: Path, media_type: str, headers: dict[str, str]) -> Response:
+    return FileResponse(
+        path, media_type=media_type, filename=path.name, content_disposition_type="inline", headers=headers
+    )
+
+
+def _cloud(service: Service, scan_id: UUID, form: str, camera: str | None, known: str | None) -> Response:
+    """One of `requested_forms`. Made only when a scan is over: it takes all of its files."""
+    place = service.folder.scan(scan_id)
+    path = place / form.format(camera=camera)
+    record = service.store.get(scan_id, JobKind.SCAN)
+    service.scan_retention.reading(scan_id)
+    if not record.state.final or not has_sources(service.folder, place, camera):
+        refuse_absent(record, path.name)
+    headers = _headers(scan_id, path.name)
+    if _still_known(known, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    if not os.path.lexists(path):
+        make_cloud(service, scan_id, form, camera)
+    if not service.folder.owns(path):
+        refuse_absent(record, path.name)
+    return _kept(path, requested_forms()[form], headers)
+
+
+def _made_so_far(folder: DataFolder, record: JobRecord, name: str) -> bytes | None:
+    """A file of a scan that is being reconstructed, once it is there, or its mesh. Read as a whole: the scan may be put
+    in its place at any moment; what is made of the mesh is kept only there.
+    """
+    if record.state is not JobState.COMPUTING:
+        return None
+    for place in folder.places(record.id):
+        with suppress(FileNotFoundError):
+            return converted(folder.read(place / MESH), name) if name in ON_REQUEST else folder.read(place / name)
+    return None
+
+
+def _headers(job_id: UUID, name: str) -> dict[str, str]:
+    # A job's files never change once they are there, and an id is never given twice.
+    return {"ETag": f'"{job_id}/{name}"', "Cache-Control": "private, no-cache"}
+
+
+def _still_known(known: str | None, tag: str) -> bool:
+    if known is None:
+        return False
+    tags = [candidate.strip().removeprefix("W/") for candidate in known.split(",")]
+    return "*" in tags or tag in tags
+
+
+def _serve(name: str, media_type: str) -> Callable[..., Response]:
+    def fetch(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
+        return _file(service, scan_id, name, media_type, known)
+
+    made = " It is made of mesh.ply when it is asked for, and kept once the scan is over." if name in ON_REQUEST else ""
+    fetch.__doc__ = (
+        f"Return {name} of a scan that succeeded, or that is being reconstructed, as soon as it is there.{made} ETags "
+        "are honoured, and ranges once the scan is over."
+    )
+    return fetch
+
+
+_UNCHANGED: dict[int | str, dict[str, Any]] = {304: {"description": "the file is the one whose ETag was sent"}}
+
+
+def file_answers(media_type: str, *further: int) -> dict[int | str, dict[str, Any]]:
+    """The `responses` of a route that answers with a file that never changes."""
+    # A part of a JSON file is no JSON.
+    part = {"description": "the range that was asked for", "content": {media_type: {"schema": BYTES}}}
+    return {**file_of(media_type, 409, 416, *further), 206: part, **_UNCHANGED}
+
+
+for _name, _media_type in MEDIA_TYPES.items():
+    _fetch = _serve(_name, _media_type)
+    router.add_api_route(
+        f"/{_name}",
+        _fetch,
+        methods=["GET"],
+        response_class=Response,
+        responses=file_answers(_media_type),
+        operation_id=f"fetch_{_name.replace('.', '_')}",
+        summary=f"Fetch {_name}",
+    )
+
+
+def _serve_cloud(form: str) -> Callable[..., Response]:
+    if "{camera}" in form:
+
+        def fetch(service: Serving, scan_id: UUID, camera: Camera, known: KnownTag = None) -> Response:
+            return _cloud(service, scan_id, form, camera, known)
+
+        what = f"{form.format(camera='CAMERA')}, the surface of a finished scan in the grid of a camera"
+    else:
+
+        def fetch(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:  # type: ignore[misc]
+            return _cloud(service, scan_id, form, None, known)
+
+        what = f"{form}, a finished scan with the points of all cameras"
+    fetch.__doc__ = (
+        f"Return {what}. It is made of the scan's files when it is first requested, and kept; 503 while others are "
+        "computed for long."
+    )
+    return fetch
+
+
+for _form, _media_type in requested_forms().items():
+    router.add_api_route(
+        f"/{_form}",
+        _serve_cloud(_form),
+        methods=["GET"],
+        response_class=Response,
+        responses=file_answers(_media_type, 501, 503, 507),
+        operation_id=f"fetch_camera_{_form.replace('-{camera}.', '_')}"
+        if "{" in _form
+        else f"fetch_{_form.replace('.', '_')}",
+        summary=f"Fetch {_form}",
+    )
+
+
+@router.get(f"/{CALIBRATION_USED}", response_class=Response, responses=file_answers("application/json"))
+def fetch_calibration_used(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
+    """Return the calibration that a finished scan was made with: lenses and poses of its devices."""
+    return _file(service, scan_id, f"{BUNDLE}/{CALIBRATION}", "application/json", known)
+
+
+@router.get(f"/{rejected_picture('{camera}')}", response_class=Response, responses=file_answers("image/png"))
+def fetch_rejected(
+    service: Serving,
+    scan_id: UUID,
+    camera: Camera,
+    known: KnownTag = None,
+) -> Response:
+    """Return the picture of a camera's refused pixels, one colour per cause."""
+    return _file(service, scan_id, rejected_picture(camera), "image/png", known)
+
+
+@router.get(f"/{causes_picture('{camera}')}", response_class=Response, responses=file_answers("image/png"))
+def fetch_causes(
+    service: Serving,
+    scan_id: UUID,
+    camera: Camera,
+    known: KnownTag = None,
+) -> Response:
+    """Return why each pixel of a camera gave no point: grey values are places in report.json's `causes`."""
+    return _file(service, scan_id, causes_picture(camera), "image/png", known)
+
+
+@router.get(f"/{agreement_picture('{camera}')}", response_class=Response, responses=file_answers("image/png"))
+def fetch_agreement(
+    service: Serving,
+    scan_id: UUID,
+    camera: Camera,
+    known: KnownTag = None,
+) -> Response:
+    """Return how far columns and rows disagree at each pixel of a camera; only scans that played both axes have it."""
+    return _file(service, scan_id, agreement_picture(camera), "image/png", known)
+
+
+@router.get(f"/{BUNDLE_ZIP}", response_class=Response, responses={**file_of("application/zip", 409), **_UNCHANGED})
+def fetch_bundle(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
+    """Return the recorded frames and all that belongs to them; unzipped, `slrig reconstruct` reads them.
+
+    A scan whose reconstruction failed has its bundle, too.
+    """
+    record = service.store.get(scan_id, JobKind.SCAN)
+    service.scan_retention.reading(scan_id)
+    bundle = service.folder.scan(scan_id) / BUNDLE
+    if not record.state.final or not service.folder.owns(bundle):
+        refuse_absent(record, BUNDLE_ZIP)
+    headers = {**_headers(scan_id, BUNDLE_ZIP), "Content-Disposition": f'attachment; filename="{scan_id}.zip"'}
+    if _still_known(known, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    return StreamingResponse(zipped(bundle), media_type="application/zip", headers=headers)
+
+
+class _Outlet(bytearray):
+    """A file that only grows: what was written is taken out as it comes."""
+
+    def write(self, data: bytes) -> int:
+        self.extend(data)
+        return len(data)
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def take(self) -> bytes:
+        taken = bytes(self)
+        self.clear()
+        return taken
+
+
+def zipped(folder: Path) -> Iterator[bytes]:
+    """The files of a folder as the bytes of a zip, stored (frames are compressed already), a piece at a time.
+
+    The same files give the same bytes: names are sorted, and all times are the zip format's first.
+    """
+    outlet = _Outlet()
+    with zipfile.ZipFile(outlet, "w") as archive:  # type: ignore[call-overload] # write and flush are enough
+        for path in sorted(folder.rglob("*")):
+            # What a link leads to was not recorded here.
+            if path.is_symlink() or not path.is_file():
+                continue
+            entry = zipfile.ZipInfo(path.relative_to(folder).as_posix(), _ZIP_EPOCH)
+            entry.external_attr = 0o644 << 16
+            with path.open("rb") as source, archive.open(entry, "w", force_zip64=True) as member:
+                while piece := source.read(_CHUNK_BYTES):
+                    member.write(piece)
+                    yield outlet.take()
+            yield outlet.take()
+    yield outlet.take()

@@ -1,0 +1,1 @@
+"""Tests of slrig.model_jobs."""
