@@ -161,60 +161,43 @@ class FrameFeed:
                 return
 
 
-class FedFrames:
-    """The other end: the frames of the capture under way, as far as they have come. begin : makes what takes them."""
+class FedCaptures:
+    """The other end: what has taken the frames of the captures that no task has used yet, by the number of the task: of
+    one that is computed next, and one that is under way.
+
+    begin : makes what takes the frames of a capture, as `slrig.scan.stream.LiveScan`, of its header, calibration and
+    region.
+    """
 
     def __init__(self, begin: Callable[..., Any]) -> None:
         self._begin = begin
-        self._live: Any = None
-
-    def hear(self, message: object) -> None:
-        """Take a message of a feed. Frames that cannot be used are forgotten: reading the bundle will tell why."""
-        try:
-            match message:
-                case Begin(header, calibration, region):
-                    self._live = self._begin(header, calibration, region)
-                case Shot() if self._live is not None:
-                    self._live.take(message)
-                case EvidenceSummary() if self._live is not None:
-                    self._live.end(message)
-                case Abandon():
-                    self.forget()
-        except Exception as error:  # noqa: BLE001 - a head start that fails is no failure of the scan
-            _log.warning("frames could not be used while they were taken", cause=repr(error))
-            self.forget()
-
-    def taken(self) -> Any:
-        """What has taken the frames, None when nothing has."""
-        return self._live
-
-    def forget(self) -> None:
-        """Let the frames go."""
-        self._live = None
-
-
-class FedCaptures:
-    """The frames of the captures that no task has used yet, by the number of the task: of one that is computed next,
-    and one that is under way. receiver : makes what takes the frames of a capture.
-    """
-
-    def __init__(self, receiver: Callable[[], FedFrames]) -> None:
-        self._receiver = receiver
-        self._captures: dict[int, FedFrames] = {}
+        self._captures: dict[int, Any] = {}
 
     def hear(self, number: int, message: object) -> None:
-        """Take a message of a capture's feed."""
+        """Take a message of a capture's feed. Frames that cannot be used are let go: reading the bundle shows why."""
         if number not in self._captures:
             if self._captures and number < max(self._captures):
                 return
             self._captures = {each: self._captures[each] for each in sorted(self._captures)[-1:]}
-            self._captures[number] = self._receiver()
-        self._captures[number].hear(message)
+            self._captures[number] = None
+        live = self._captures[number]
+        try:
+            match message:
+                case Begin(header, calibration, region):
+                    self._captures[number] = self._begin(header, calibration, region)
+                case Shot() if live is not None:
+                    live.take(message)
+                case EvidenceSummary() if live is not None:
+                    live.end(message)
+                case Abandon():
+                    self._captures[number] = None
+        except Exception as error:  # noqa: BLE001 - a head start that fails is no failure of the scan
+            _log.warning("frames could not be used while they were taken", cause=repr(error))
+            self._captures[number] = None
 
     def taken(self, number: int) -> Any:
         """What has taken the frames of a capture, None when nothing has; they are let go here."""
-        frames = self._captures.pop(number, None)
-        return None if frames is None else frames.taken()
+        return self._captures.pop(number, None)
 
 
 class Recording(Protocol):

@@ -171,7 +171,7 @@ def serve(
     """The child's life: prepare, then do jobs until the parent's end of the pipe is gone.
 
     stops : brings the numbers of jobs that are not wanted any more, past whatever waits in the pipe. heartbeat : takes
-    the time of the last sign of life, `time.monotonic`. module : offers `warm_kernels(told)`, and `frame_receiver()`
+    the time of the last sign of life, `time.monotonic`. module : offers `warm_kernels(told)`, and `LiveScan`
     for the frames of a capture; jobs find it as `JobRun.pipeline`. logs : how the parent logs.
     """
     if logs is not None:
@@ -184,7 +184,7 @@ def serve(
     threading.Thread(target=_beat, args=(heartbeat,), name="slrig-heartbeat", daemon=True).start()
     try:
         loaded = importlib.import_module(module)
-        fed = FedCaptures(loaded.frame_receiver)
+        fed = FedCaptures(loaded.LiveScan)
         loaded.warm_kernels(lambda prepared: sent(pipe, Preparing(prepared.done, prepared.total)))
     except Exception as error:  # noqa: BLE001 - whatever it is, the parent and the log are told
         sent(pipe, Unloadable(f"{type(error).__name__}: {error}"))

@@ -21,7 +21,6 @@ from slrig.capture import EvidenceSummary
 from slrig.disk import storage_errors
 from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, ScanCancelledError, setting
 from slrig.jobs.database import computed
-from slrig.jobs.job import FedFrames
 from slrig.kernels import KernelCount, report_compilations, trim_malloc
 from slrig.meshing import (
     MeshingLimits,
@@ -347,11 +346,6 @@ def reconstruct_into(
         place(REPORT, encode_report(report))
     progress("done", 1.0, f"{len(mesh.faces)} triangles")
     return report
-
-
-def frame_receiver() -> FedFrames:
-    """What takes the frames of a capture while they come: see `slrig.jobs.worker.serve`."""
-    return FedFrames(LiveScan)
 
 
 def warm_kernels(told: Callable[[KernelCount], None]) -> None:

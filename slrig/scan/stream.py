@@ -658,7 +658,7 @@ class LiveScan(ScanStream):
         """Take one frame."""
         self._frames.append((shot.pattern, shot.camera))
         self._exposures_s[shot.camera].add(shot.exposure_s)
-        super().take(shot)
+        self._cameras[shot.camera].take(shot)
         self.watch.enter(WAITING)
 
     @property

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from slrig.kernels import KernelCount
-from tests.unit.scan.fake_pipeline import frame_receiver, reconstruct_into
+from tests.unit.scan.fake_pipeline import LiveScan, reconstruct_into
 
-__all__ = ["frame_receiver", "reconstruct_into", "warm_kernels"]
+__all__ = ["LiveScan", "reconstruct_into", "warm_kernels"]
 
 
 def warm_kernels(told: Callable[[KernelCount], None]) -> None:

@@ -31,7 +31,7 @@ class TameCompute:
     def __init__(self, module: str, before: Callable[[Cancelled], object] = lambda _: None) -> None:
         self._pipeline = import_module(module)
         self._before = before
-        self._captures = FedCaptures(self._pipeline.frame_receiver)
+        self._captures = FedCaptures(self._pipeline.LiveScan)
         self._numbers = itertools.count(1)
         self.jobs = 0
         self._turn = threading.Lock()

@@ -15,7 +15,6 @@ import numpy as np
 
 from slrig.capture.verifier import EvidenceSummary
 from slrig.errors import NothingToReconstructError, ScanCancelledError
-from slrig.jobs.job import FedFrames
 from slrig.model import Calibration, Mesh, Region, Shot
 from slrig.model.capture import CaptureHeader
 from slrig.scan.artefacts import MESH, encode_mesh_ply
@@ -63,11 +62,6 @@ class LiveScan:
 def _die() -> None:
     assert multiprocessing.parent_process() is not None, "this needs a worker with a process of its own"
     os.kill(os.getpid(), signal.SIGKILL)
-
-
-def frame_receiver() -> FedFrames:
-    """What takes frames."""
-    return FedFrames(LiveScan)
 
 
 def warm_kernels(_told: object) -> None:

@@ -20,7 +20,7 @@ from slrig.scan.preparation import prepare_kernels
 
 def test_the_production_pipeline_has_all_that_the_worker_looks_up() -> None:
     loaded = importlib.import_module(PIPELINE)
-    assert all(callable(each) for each in (loaded.reconstruct_into, loaded.warm_kernels, loaded.frame_receiver))
+    assert all(callable(each) for each in (loaded.reconstruct_into, loaded.warm_kernels, loaded.LiveScan))
 
 
 def test_every_kernel_of_a_usual_scan_is_prepared() -> None:
