@@ -1,7 +1,7 @@
 """Kills at random instants of the service, its worker, or both, while jobs of every kind run.
 
-`SLRIG_KILLS` is their number, `SLRIG_KILLS_SEED` the seed of the instants. After each kill and the next start every job
-that was accepted has one end, nothing half written is left, and the rig scans.
+`SLRIG_FUZZ_KILLS` is their number, `SLRIG_FUZZ_SEED` the seed of the instants. After each kill and the next start every
+job that was accepted has one end, nothing half written is left, and the rig scans.
 """
 
 from __future__ import annotations
@@ -26,11 +26,14 @@ from tests.e2e.faulty_rig.service import half_written
 from tests.e2e.test_calibration_walk import BOARD, RIG, SCENE
 
 pytestmark = pytest.mark.slow
-KILLS = int(os.environ.get("SLRIG_KILLS") or 4)
-SEED = int(os.environ.get("SLRIG_KILLS_SEED") or 45)
+KILLS = int(os.environ.get("SLRIG_FUZZ_KILLS") or 4)
+SEED = int(os.environ.get("SLRIG_FUZZ_SEED") or 45)
 SPAN_S = 9.0
 """All jobs of a round take about so long on two cores."""
 END_LIMIT_S = 120.0
+
+SAME = [[float(row == column) for column in range(4)] for row in range(4)]
+"""The pose of both scans of a model, 4 x 4."""
 
 FINAL = {"succeeded", "failed", "cancelled", "interrupted"}
 WANTED = ["service", "worker", "both"]
@@ -48,8 +51,8 @@ class Rounds:
         self.session: str = self._post("/calibration", {"board": BOARD})["id"]
         self.test: str | None = None
         self.scans = [self._ended(self._begin("/scan", {"if_busy": "queue"})) for _ in range(2)]
-        for _ in range(3):
-            self._ended(self._begin(f"/calibration/{self.session}/pose", {"if_busy": "queue"}))
+        for position in range(2, 6):
+            self._ended(self._begin(f"/calibration/{self.session}/pose", {"if_busy": "queue", "position": position}))
 
     def _client(self) -> httpx2.Client:
         headers = {"Authorization": f"Bearer {KEY}"}
@@ -76,7 +79,16 @@ class Rounds:
 
     def _ended(self, job_id: str) -> str:
         self._until(lambda: self._states().get(job_id, ("", ""))[1] in FINAL, f"the end of {job_id}")
+        assert self._states()[job_id][1] == "succeeded", (job_id, self._faults())
         return job_id
+
+    def _faults(self) -> list[Any]:
+        with sqlite3.connect(self.service.data / "slrig.sqlite") as database:
+            found = database.execute(
+                "select kind, failure_code, failure_message from job where failure_code is not null"
+            ).fetchall()
+        database.close()
+        return found
 
     def _until(self, reached: Callable[[], bool], what: str) -> None:
         never = threading.Event()
@@ -91,11 +103,11 @@ class Rounds:
         turn = {"if_busy": "queue"}
         requests = [
             ("/scan", turn),
-            (f"/calibration/{self.session}/pose", turn),
-            ("/rig/verification", {**turn, "board": BOARD}),
+            (f"/calibration/{self.session}/pose", {**turn, "position": 3}),
+            ("/rig/verification", {**turn, "board": BOARD, "position": 4}),
             ("/rig/doctor", turn),
             ("/rig/latency", {**turn, "flashes": 8}),
-            ("/model", {"scans": self.scans, "poses": "unknown"}),
+            ("/model", {"scans": self.scans, "poses": [SAME, SAME]}),
             (f"/calibration/{self.session}/solve", {}),
             ("/scan", {**turn, "exposure_s": 0.01}),
         ]
