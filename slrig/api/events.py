@@ -19,10 +19,9 @@ from slrig.api.problems import fault_problem, problems
 from slrig.api.service import Serving
 from slrig.calibrate.store import CalibrationRegister, SessionState
 from slrig.config import ServiceSettings
-from slrig.doctor import EXAMINATIONS
 from slrig.errors import CalibrationNotFoundError, JobNotFoundError
 from slrig.failure import JobFailure
-from slrig.jobs.records import JobEvent, JobKind, JobState
+from slrig.jobs.records import RIG_JOBS, JobEvent, JobKind, JobState
 from slrig.jobs.store import EVERY_JOB, JobStore
 
 _LAST_WORD_S = 2.0
@@ -259,7 +258,7 @@ async def follow_everything(
 
 async def _follow_job(place: Place, service: Serving, kind: JobKind | None, job_id: UUID, after: int) -> Response:
     # One that is on no record is refused here; one that is deleted later only ends its stream.
-    await run_in_threadpool(service.store.get, job_id, *(EXAMINATIONS if kind is None else (kind,)))
+    await run_in_threadpool(service.store.get, job_id, *(RIG_JOBS if kind is None else (kind,)))
     return await _stream(place, service.settings, job_id, followed_job(service.store, job_id), after)
 
 

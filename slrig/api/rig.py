@@ -40,7 +40,7 @@ from slrig.bundle import (
     turntable_entry,
     turntable_record,
 )
-from slrig.calibrate.job import turntable_axis
+from slrig.calibrate.job import AxisJob, turntable_axis
 from slrig.calibrate.store import session_readings, setting_of
 from slrig.calibrate.verification import VerificationJob, health_svg
 from slrig.calibration import Board
@@ -49,11 +49,11 @@ from slrig.capture import DEFAULT_SEARCH_S, DEFAULT_TRIALS
 from slrig.conformance import ConformanceJob
 from slrig.devices import CameraInfo, FoundDevice, Trigger
 from slrig.discovery import InstalledDriver, MissingLibrary, OtherSystem, discover_devices, installed_drivers
-from slrig.doctor import EXAMINATIONS, DoctorJob, Examination, LatencyJob, last_examination
+from slrig.doctor import DoctorJob, Examination, LatencyJob, last_examination
 from slrig.errors import CalibrationError, CalibrationStateError, ConfigError, ScanStateError, SlrigError
 from slrig.jobs.job import Job
 from slrig.jobs.manager import RigStatus
-from slrig.jobs.records import JobKind, JobRecord, JobState, utc_now
+from slrig.jobs.records import RIG_JOBS, JobKind, JobRecord, JobState, utc_now
 from slrig.jobs.worker import Task
 from slrig.model_jobs.job import turntable_planes
 from slrig.model_jobs.turntable import TurntableState, state_of, turntable_svg
@@ -308,13 +308,13 @@ def check_conformance(
 @examination_router.get("/job/{job_id}")
 def look_at_rig_job(service: Serving, job_id: UUID) -> ExaminationBody:
     """Return an examination: its state, and what was found, or why nothing was."""
-    return _examination(service.store.get(job_id, *EXAMINATIONS))
+    return _examination(service.store.get(job_id, *RIG_JOBS))
 
 
 @examination_router.post("/job/{job_id}/cancel", status_code=202)
 def cancel_rig_job(service: Serving, job_id: UUID) -> ExaminationBody:
     """Ask an examination to end early. May be repeated."""
-    return _examination(service.manager.cancel(service.store.get(job_id, *EXAMINATIONS).id))
+    return _examination(service.manager.cancel(service.store.get(job_id, *RIG_JOBS).id))
 
 
 def _started(
@@ -523,6 +523,20 @@ class AxisRequest(Strict):
     )
 
 
+class AxisShootRequest(ExaminationRequest):
+    """The axis from a board that stands on the turntable, which is turned from shot to shot."""
+
+    board: BoardRequest | None = Field(default=None, description="Default: that of the active calibration")
+    first_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
+        default=-50.0, description="angle of the first shot, from where the turntable stands when it is opened"
+    )
+    step_deg: Annotated[float, Field(gt=0, le=180)] = 20.0
+    count: Annotated[int, Field(ge=3, le=72)] = Field(
+        default=6, description="shots; cameras must see the board in them"
+    )
+    exposure_s: Annotated[float, Field(gt=0, le=MOST_EXPOSURE_S)] | None = None
+
+
 class PlanesRequest(Strict):
     """The planes from a scan of the turntable with nothing on it."""
 
@@ -586,6 +600,21 @@ def calibrate_turntable(service: Serving, request: Annotated[AxisRequest, Body()
         for name, left in found.residual_mm.items()
     ]
     return AxisBody(**dict(_turntable(turntable)), poses=poses)
+
+
+@turntable_router.post("/turntable/shoot", status_code=202, responses=problems(409, 429, 502, 503, 507))
+def shoot_axis(
+    service: Serving,
+    response: Response,
+    request: Annotated[AxisShootRequest, Body(default_factory=AxisShootRequest)],
+    idempotency_key: IdempotencyKey = None,
+) -> ExaminationBody:
+    """Shoot a board that stands on the turntable at several angles, and measure the axis, by the calibration in use.
+    The answer comes at once; look again later.
+    """
+    board = _board_in_use(service) if request.board is None else request.board.board()
+    job = AxisJob(board, request.first_deg, request.step_deg, request.count, request.exposure_s)
+    return _started(service, response, job, request, idempotency_key)
 
 
 @turntable_router.post("/turntable/planes", responses=problems(404, 409, 503, 507))

@@ -32,7 +32,7 @@ from slrig.api.auth import LINK_PATH, KeyRing, Sessions, first_key
 from slrig.api.problems import MEDIA_TYPE, http_problem
 from slrig.api.service import Service
 from slrig.bundle import write_file
-from slrig.calibrate.job import PoseJob, SolveJob
+from slrig.calibrate.job import AxisJob, PoseJob, SolveJob
 from slrig.calibrate.verification import VerificationJob
 from slrig.compute.pooled import require_pool_extra
 from slrig.config import RigConfig, ServiceSettings, is_loopback
@@ -314,7 +314,7 @@ def quiet_accepts(loop: asyncio.AbstractEventLoop) -> None:
 
 
 KINDS = (
-    ScanJob, VerificationJob, PoseJob, SolveJob, PositionJob, ModelJob, DoctorJob, LatencyJob, ConformanceJob,
+    ScanJob, VerificationJob, PoseJob, SolveJob, PositionJob, ModelJob, DoctorJob, LatencyJob, ConformanceJob, AxisJob,
 )  # fmt: skip
 """Every kind of job that a service runs."""
 

@@ -25,7 +25,7 @@ from slrig.catalogue.store import Copier, catalogue_of, standing
 from slrig.config import ServiceSettings
 from slrig.doctor import EXAMINATIONS, Examinations
 from slrig.jobs.manager import JobManager
-from slrig.jobs.records import JobEvent, JobKind, JobProgress, JobRecord, JobState, stages_of, utc_now
+from slrig.jobs.records import RIG_JOBS, JobEvent, JobKind, JobProgress, JobRecord, JobState, stages_of, utc_now
 from slrig.jobs.resume import resume
 from slrig.jobs.store import Audit, AuditEntry, JobStore, RequestKeys
 from slrig.model_jobs.job import TURNTABLE, Models, ViewShooting
@@ -177,6 +177,7 @@ class Service:
         self.acceptance = AcceptanceTests(manager, tolerance_mm=tolerance_mm)
         self.turntable = TurntableStore(self.folder.root / TURNTABLE)
         spare_bytes = settings.min_free_bytes
+        manager.groups[JobKind.AXIS] = self.turntable
         self.models = Models(manager, turntable=self.turntable, keep=settings.keep_models, spare_bytes=spare_bytes)
         self.shooting = ViewShooting(self.models, manager)
         self.durations = Durations()
@@ -223,7 +224,7 @@ class Service:
             self.shooting.view_ended(record)
             self.scan_retention.look()
         try:
-            if record.kind is JobKind.VERIFICATION or record.kind in EXAMINATIONS:
+            if record.kind is JobKind.VERIFICATION or record.kind in RIG_JOBS:
                 self.store.prune(record.kind, _MOST_ON_RECORD)
             events = self.store.events(record.id, after=0)
             self.durations.ended(record, events)

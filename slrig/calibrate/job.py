@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -43,6 +44,8 @@ from slrig.calibrate.store import (
 )
 from slrig.calibration import PROJECTOR, Board, BoardShape, PoseObservation
 from slrig.calibration.accuracy import Comparison
+from slrig.devices import Turntable
+from slrig.disk import storage_errors
 from slrig.errors import (
     ArtefactNotReadyError,
     CalibrationError,
@@ -64,7 +67,7 @@ from slrig.jobs.worker import Task
 from slrig.model import Calibration, Size
 from slrig.rig.session import ActiveCalibration, RigFacts, RigSession
 from slrig.scan.acquisition import capture_frames
-from slrig.scan.plan import PatternPlan, ScanPlan, check_plan
+from slrig.scan.plan import PatternPlan, ScanPlan, check_plan, no_turntable
 
 if TYPE_CHECKING:
     from slrig.multiview import BoardAxis
@@ -109,9 +112,7 @@ class PoseJob(Job):
 
     def compute(self, run: JobRun) -> Outcome:
         """Read the pose, judge it by those before it, and draw what each camera saw."""
-        from slrig.calibrate import pose_reading
-        from slrig.calibrate import report as pose_judging
-        from slrig.calibrate import report as pose_pictures
+        from slrig.calibrate import pose_reading, report
         from slrig.calibrate.pose_reading import bundle_device_sizes
 
         session = _session_folder(run)
@@ -122,16 +123,16 @@ class PoseJob(Job):
         setting, reading = setting_of(record), None
         try:
             reading = pose_reading.read_pose(run.bundle, setting.board, f"pose {self.number}")
-            judged = pose_judging.judgement(reading, session_readings(session), setting)
+            judged = report.judgement(reading, session_readings(session), setting)
         except PoseRefusedError as error:
             # The number stands beside it; and the person shot it just now.
-            judged = pose_judging.Judgement((str(error).removeprefix(f"pose 'pose {self.number}': "),), {}, None)
+            judged = report.Judgement((str(error).removeprefix(f"pose 'pose {self.number}': "),), {}, None)
         run.check()
         answer = {"refused": list(judged.refusals), "answer": judged.answer}
         with disk_errors(run.folder):
             write_durably(run.folder / ANSWER, (json.dumps(answer, indent=1, allow_nan=False) + "\n").encode())
             for camera in setting.cameras:
-                picture = pose_pictures.pose_png(run.bundle, camera, reading, setting.board)
+                picture = report.pose_png(run.bundle, camera, reading, setting.board)
                 write_durably(run.folder / picture_name(camera), picture)
             if reading is not None and not judged.refusals:
                 write_durably(run.folder / READING, reading_bytes(reading))
@@ -171,21 +172,15 @@ class SolveJob(Job):
 
     def compute(self, run: JobRun) -> Outcome:
         """Solve, and write the calibration and its report."""
-        from slrig.calibrate import report as pose_judging
-        from slrig.calibrate import store as solving
+        from slrig.calibrate import report, store
 
         session = _session_folder(run)
         record = with_poses_on_disk(read_session(session), session)
         setting, poses = setting_of(record), session_readings(session)
         compared = session / COMPARED
-
-        def report(stage: str, fraction: float, detail: str, /) -> None:
-            run.check()
-            run.report(stage, fraction, detail)
-
-        result = solving.solve_poses(
+        result = store.solve_poses(
             setting.board, setting.cameras, setting.projector, poses,
-            progress=report,
+            progress=run.step,
             earlier=read_calibration(compared) if compared.is_file() else None,
             board_shape=self.board_shape,
             tolerance_mm=self.tolerance_mm,
@@ -195,8 +190,8 @@ class SolveJob(Job):
             result = replace(result, calibration=replace(result.calibration, solved=solved))
         bundles = {pose.name: session / "poses" / f"{pose.number:02d}" / BUNDLE for pose in record.accepted}
         write_calibration(run.folder / CALIBRATION, result.calibration)
-        pose_judging.write_report(run.folder / REPORT, result, poses, record, bundles)
-        return Outcome({"solve": self.number, "result": pose_judging.summary(result)})
+        report.write_report(run.folder / REPORT, result, poses, record, bundles)
+        return Outcome({"solve": self.number, "result": report.summary(result)})
 
     def place(self, data: DataFolder, job_id: UUID) -> Path:  # noqa: ARG002 - as it is called
         """See `Job`."""
@@ -259,6 +254,109 @@ def warm() -> None:
     from slrig.calibrate.report import warm
 
     warm()
+
+
+@dataclass(frozen=True, slots=True)
+class AxisJob(Job):
+    """The axis of the turntable from a board that stands on it, shot at `count` angles, `step_deg` apart from
+    `first_deg` on.
+    """
+
+    kind: ClassVar[JobKind] = JobKind.AXIS
+    noun: ClassVar[str] = "axis of the turntable"
+
+    board: Board
+    first_deg: float = -50.0
+    step_deg: float = 20.0
+    count: int = 6
+    exposure_s: float | None = None
+
+    def check(self, rig: RigSession) -> int:
+        """See `Job`. Raises UnsupportedByDeviceError: the rig has no turntable; CalibrationStateError, PatternError."""
+        if rig.facts is None:
+            return 0
+        rig.refuse_misfit()
+        if not rig.facts.turntable:
+            raise no_turntable(self.step_deg)
+        if rig.calibration is None:
+            message = "The rig has no calibration in use, by which poses of a board give an axis. Activate one first."
+            raise CalibrationStateError(message)
+        return self.count * check_plan(self._scan, rig.facts)
+
+    @property
+    def capture_share(self) -> float:
+        """See `Job`."""
+        return 0.7
+
+    def capture(self, rig: RigSession, run: JobRun) -> None:
+        """Turn the board, and record a bundle at each angle; at the end the turntable is where it was."""
+        opened = rig.open()
+        table = opened.positioner
+        if not isinstance(table, Turntable):
+            raise no_turntable(self.step_deg)
+        with storage_errors(run.recording):
+            run.recording.mkdir()
+        # A board must not be known beforehand, as a rendered rig knows its scene.
+        bare = replace(opened, head=None)
+        for number, angle_deg in enumerate(self._angles_deg):
+            name = f"{angle_deg:g}°"
+            run.step(f"{name}: turn", number / self.count, "")
+            table.turn(angle_deg)
+
+            def progress(stage: str, fraction: float, detail: str, /, name: str = name, done: int = number) -> None:
+                run.report(f"{name}: {stage}", (done + fraction) / self.count, detail)
+
+            place = run.recording / f"{number:02d}"
+            capture_frames(bare, self._scan, place, progress=progress, cancelled=run.cancelled).finish()
+        table.turn(0.0)
+
+    def compute(self, run: JobRun) -> Outcome:
+        """Read the board at each angle, and find what it turned about. Poses that cannot be read are left out.
+
+        Raises TurntableRefusedError: fewer than three are left, or they give no axis.
+        """
+        from slrig.calibrate.pose_reading import axis_of_poses, read_pose
+
+        calibration = read_calibration(run.bundle / "00" / CALIBRATION)
+        read, angles_deg, refused = [], [], {}
+        for number, angle_deg in enumerate(self._angles_deg):
+            run.step("reading the board", number / self.count, f"{angle_deg:g}°")
+            try:
+                read.append(read_pose(run.bundle / f"{number:02d}", self.board, f"{angle_deg:g}°").observation)
+                angles_deg.append(angle_deg)
+            except PoseRefusedError as error:
+                refused[f"{angle_deg:g}°"] = str(error)
+        found = axis_of_poses(read, self.board, calibration, angles_deg)
+        axis = found.axis.measured_axis
+        return Outcome(
+            {
+                "axis": {
+                    "point_mm": axis.point_mm.tolist(),
+                    "direction": axis.direction.tolist(),
+                    "covariance": axis.covariance.tolist(),
+                    "point_sigma_mm": axis.point_sigma_mm,
+                    "direction_sigma_deg": math.degrees(axis.direction_sigma_rad),
+                },
+                "poses": [
+                    {
+                        "name": name,
+                        "residual_mm": left,
+                        "angle_deg": found.angles_deg[name],
+                        "error_deg": found.errors_deg.get(name),
+                    }
+                    for name, left in found.residual_mm.items()
+                ],
+                "refused": refused,
+            }
+        )
+
+    @property
+    def _angles_deg(self) -> list[float]:
+        return [self.first_deg + number * self.step_deg for number in range(self.count)]
+
+    @property
+    def _scan(self) -> ScanPlan:
+        return ScanPlan(patterns=USUAL_PATTERNS, exposure_s=self.exposure_s)
 
 
 def turntable_axis(

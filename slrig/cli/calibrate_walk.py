@@ -323,9 +323,9 @@ _STATES = {"queued": "waiting for the rig", "capturing": "shooting", "computing"
 _KEYS = "[bold]Enter[/bold] shoot   [bold]s[/bold] solve   [bold]d[/bold] drop the last   [bold]q[/bold] leave"
 
 
-def opened(client: Client, board: Board, *, label: str | None, projector: bool = True) -> dict[str, Any]:
-    """A new session for a board; without the projector, of the cameras alone. Raises ServiceError."""
-    asked: dict[str, Any] = {
+def board_request(board: Board) -> dict[str, Any]:
+    """A board as requests have it."""
+    return {
         "kind": str(board.kind),
         "corners": [board.columns, board.rows],
         "square_mm": board.square_mm,
@@ -334,7 +334,11 @@ def opened(client: Client, board: Board, *, label: str | None, projector: bool =
         "square_sigma": board.square_sigma,
         "aspect": board.aspect,
     }
-    return client.post("/calibration", {"board": asked, "label": label, "projector": projector})
+
+
+def opened(client: Client, board: Board, *, label: str | None, projector: bool = True) -> dict[str, Any]:
+    """A new session for a board; without the projector, of the cameras alone. Raises ServiceError."""
+    return client.post("/calibration", {"board": board_request(board), "label": label, "projector": projector})
 
 
 def walk(

@@ -349,6 +349,74 @@ turntable_app = typer.Typer(no_args_is_help=True, help="A turntable's axis, its 
 
 @turntable_app.command()
 @grouped
+def shoot(
+    *,
+    asked: BoardArguments,
+    first_deg: Annotated[float, typer.Option(help="Angle of the first shot.")] = -50.0,
+    step_deg: Annotated[float, typer.Option(min=1.0, max=180.0, help="Turned by so much from shot to shot.")] = 20.0,
+    count: Annotated[int, typer.Option(min=3, max=72, help="Shots. The cameras must see the board in them.")] = 6,
+    exposure_s: Annotated[float | None, typer.Option(help="Exposure of every camera, seconds.")] = None,
+    service: ServiceOptions,
+) -> None:
+    """Have a running service turn a board, and measure the axis.
+
+    The board stands on the turntable; scans and models use the axis from then on.
+    """
+    from slrig.cli.calibrate_local import chosen_board
+    from slrig.cli.calibrate_walk import board_request
+    from slrig.cli.display import progress_shown
+    from slrig.errors import ServiceError
+
+    with service.client() as client:
+        job = client.turntable.shoot(
+            board=board_request(chosen_board(asked)), first_deg=first_deg, step_deg=step_deg, count=count,
+            exposure_s=exposure_s,
+        )  # fmt: skip
+        with progress_shown() as display:
+            try:
+                job = client.examinations.wait(job["id"], display)
+            except KeyboardInterrupt:
+                client.examinations.cancel(job["id"])
+                raise
+    if job["error"] is not None:
+        raise ServiceError(job["error"]["detail"])
+    found = job["summary"]
+    _print_poses(
+        [(each["name"], each["angle_deg"], each["error_deg"], each["residual_mm"]) for each in found["poses"]],
+        found["refused"],
+    )
+    axis = found["axis"]
+    _print_axis(axis["point_mm"], axis["direction"], axis["point_sigma_mm"], axis["direction_sigma_deg"])
+
+
+def _print_poses(poses: Sequence[tuple[str, float, float | None, float]], refused: Mapping[str, str]) -> None:
+    """Print name, angle, error of the angle and residual of each pose, and why others were left out."""
+    from rich.table import Column
+
+    from slrig.cli.display import print_table
+
+    rows = [
+        (name, f"{angle_deg:.3f}°", "" if error_deg is None else f"{error_deg:.3f}°", f"{left_mm:.4f} mm")
+        for name, angle_deg, error_deg, left_mm in poses
+    ]
+    heads = (Column(each, justify="right") for each in ("angle", "off", "residual"))
+    print_table((Column("pose", overflow="fold"), *heads), rows)
+    for name, cause in refused.items():
+        typer.echo(f"{'left out':<10}{name}: {cause}")
+
+
+def _print_axis(
+    point_mm: Sequence[float], direction: Sequence[float], point_sigma_mm: float, direction_sigma_deg: float
+) -> None:
+    (x, y, z), (a, b, c) = point_mm, direction
+    typer.echo(
+        f"{'axis':<10}through ({x:.3f}, {y:.3f}, {z:.3f}) mm ± {point_sigma_mm:.4f} mm, along "
+        f"({a:.5f}, {b:.5f}, {c:.5f}) ± {direction_sigma_deg:.4f}°"
+    )
+
+
+@turntable_app.command()
+@grouped
 def axis(
     folder: Annotated[
         Path, typer.Argument(metavar="FOLDER", help="Bundles of a board that stood on the turntable, one per angle.")
@@ -369,11 +437,9 @@ def axis(
     """
     import math
 
-    from rich.table import Column
-
     from slrig.bundle import AxisSource, read_calibration, write_file
     from slrig.cli.calibrate_local import chosen_board, pose_bundles
-    from slrig.cli.display import print_table, progress_shown
+    from slrig.cli.display import progress_shown
     from slrig.cli.reconstruct import keep_kernels
     from slrig.errors import PatternError, PoseRefusedError
     from slrig.logs import set_up_console_logs
@@ -403,20 +469,12 @@ def axis(
         record = with_axis(before, found.axis.measured_axis, source=AxisSource.BOARD, of=folder.absolute().name)
         write_file(output, encode_turntable(record))
         display("done", 1.0, "")
-    rows = [
-        (name, f"{found.angles_deg[name]:.3f}°", f"{found.errors_deg[name]:.3f}°" if found.errors_deg else "",
-         f"{left:.4f} mm")
-        for name, left in found.residual_mm.items()
-    ]  # fmt: skip
-    print_table((Column("pose", overflow="fold"), *(Column(each, justify="right") for each in
-                 ("angle", "off", "residual"))), rows)  # fmt: skip
-    for name, cause in refused.items():
-        typer.echo(f"{'left out':<10}{name}: {cause}")
-    (x, y, z), (a, b, c) = found.axis.point_mm, found.axis.direction
-    typer.echo(
-        f"{'axis':<10}through ({x:.3f}, {y:.3f}, {z:.3f}) mm ± {found.axis.point_sigma_mm:.4f} mm, along "
-        f"({a:.5f}, {b:.5f}, {c:.5f}) ± {math.degrees(found.axis.direction_sigma_rad):.4f}°"
-    )
+    poses = [
+        (name, found.angles_deg[name], found.errors_deg.get(name), left) for name, left in found.residual_mm.items()
+    ]
+    _print_poses(poses, refused)
+    sigma_deg = math.degrees(found.axis.direction_sigma_rad)
+    _print_axis(found.axis.point_mm.tolist(), found.axis.direction.tolist(), found.axis.point_sigma_mm, sigma_deg)
     last = record.history[-1]
     if last.moved_mm is not None:
         typer.echo(

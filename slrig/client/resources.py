@@ -502,6 +502,25 @@ class TurntableResource(Resource):
         options = given(calibration=calibration, poses=poses, angles_deg=angles_deg)
         return self._connection.json("POST", "/rig/turntable/axis", json=options)
 
+    def shoot(
+        self,
+        *,
+        board: Mapping[str, Any] | None = None,
+        first_deg: float | None = None,
+        step_deg: float | None = None,
+        count: int | None = None,
+        exposure_s: float | None = None,
+        if_busy: IfBusy | None = None,
+    ) -> Json:
+        """Shoot a board on the turntable at several angles, and measure the axis: a job, as those of `examinations`.
+
+        board : that of the calibration in use by default.
+        """
+        options = given(
+            board=board, first_deg=first_deg, step_deg=step_deg, count=count, exposure_s=exposure_s, if_busy=if_busy
+        )
+        return self._connection.json("POST", "/rig/turntable/shoot", once=True, json=options)
+
     def find_planes(self, scan: str) -> Json:
         """Find the plate and backdrops in a scan of the empty turntable."""
         return self._connection.json("POST", "/rig/turntable/planes", json={"scan": scan})

@@ -60,6 +60,7 @@ class JobKind(StrEnum):
     DOCTOR = "doctor"
     CONFORMANCE = "conformance"
     LATENCY = "latency"
+    AXIS = "axis"
 
     @property
     def path(self) -> str:
@@ -71,6 +72,9 @@ class JobKind(StrEnum):
         """
         return _PATHS.get(self, "/rig/job")
 
+
+RIG_JOBS = (JobKind.DOCTOR, JobKind.CONFORMANCE, JobKind.LATENCY, JobKind.AXIS)
+"""Kinds without a resource of their own: their jobs are found at /rig/job/ID."""
 
 _PATHS = {JobKind.SCAN: "/scan", JobKind.MODEL: "/model", JobKind.VERIFICATION: "/rig/verification"}
 

@@ -20,6 +20,7 @@ from slrig.errors import IdempotencyError, JobNotFoundError, KeyInFlightError
 from slrig.failure import JobFailure
 from slrig.jobs.database import AuditRow, CopyRow, Database, EventRow, JobRow, KeyRow, NoticeRow, record_of
 from slrig.jobs.records import (
+    RIG_JOBS,
     Clock,
     JobEvent,
     JobKind,
@@ -233,7 +234,7 @@ _LISTED: dict[str, str] = {
     JobKind.SCAN: "GET /scan lists those that are.",
     JobKind.VERIFICATION: "GET /rig/health/history lists past ones.",
     JobKind.MODEL: "GET /model lists those that are.",
-    **dict.fromkeys((JobKind.DOCTOR, JobKind.CONFORMANCE), "GET /rig/examinations has the last one."),
+    **dict.fromkeys(RIG_JOBS, "GET /rig/examinations has the last one of each kind."),
 }
 
 

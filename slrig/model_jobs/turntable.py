@@ -11,6 +11,7 @@ from dataclasses import replace
 from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
+from uuid import UUID
 
 import numpy as np
 import structlog
@@ -27,6 +28,7 @@ from slrig.bundle import (
 )
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError, StorageError
+from slrig.jobs.job import Job, Outcome
 from slrig.jobs.records import utc_now
 from slrig.model import AXIS_SPAN_MM, MAX_AXIS_SIGMAS, AxisUpdate, MeasuredAxis, TurntablePlane, update_axis
 from slrig.reports.page import (
@@ -130,6 +132,18 @@ class TurntableStore:
         """Put planes on record in place of all others."""
         with self._lock:
             return self.replace(replace(self.record(), planes=tuple(planes)))
+
+    def captured(self, job: Job, job_id: UUID) -> None:
+        """See `slrig.jobs.job.Group`."""
+
+    def ended(self, job: Job, job_id: UUID, outcome: Outcome | None) -> Outcome:  # noqa: ARG002 - as it is called
+        """See `slrig.jobs.job.Group`: the axis that was measured is the one on record."""
+        if outcome is None or outcome.summary is None:
+            return outcome or Outcome()
+        found = outcome.summary["axis"]
+        axis = MeasuredAxis(*(np.array(found[name]) for name in ("point_mm", "direction", "covariance")))
+        self.put_axis(axis, source=AxisSource.BOARD, of=str(job_id))
+        return outcome
 
     def note(self, axis: MeasuredAxis, *, of: str, at: datetime | None = None) -> AxisUpdate | None:
         """Improve the axis on record by one that a model was found to turn about; None where none is on record.

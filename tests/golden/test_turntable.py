@@ -14,9 +14,13 @@ from typer.testing import CliRunner
 from simulated_rig.device import open_simulated_head
 from slrig.bundle import write_calibration
 from slrig.bundle.options import read_turntable
+from slrig.calibrate.job import AxisJob
+from slrig.calibration import Board, BoardKind
+from slrig.cli import local
 from slrig.cli.commands import app
+from slrig.config import read_rig
 from slrig.devices import CameraSettings, Rig, Turntable
-from slrig.model import PlaneKind, RotationAxis
+from slrig.model import MeasuredAxis, PlaneKind, RotationAxis
 from slrig.model_jobs.combining import read_mesh
 from slrig.multiview.registration import register_views
 from slrig.multiview.turntable import cut_view, find_turntable_planes, turntable_poses
@@ -48,7 +52,7 @@ def recorded(rig: Rig, angle_deg: float, bundle: Path, *, rows: bool) -> Path:
     return bundle
 
 
-def test_the_axis_is_found_from_a_board_at_six_angles(tmp_path: Path) -> None:
+def test_the_axis_is_found_from_a_board_at_six_angles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     axis = axis_of([3.0, 0.0, 12.0], [0.03, -1.0, -0.05])
     table = {"point_mm": axis.point_mm.tolist(), "direction": axis.direction.tolist(), "objects": ["board"]}
     options = board_options(cameras=2, carries_calibration=True, turntable=table)
@@ -70,6 +74,20 @@ def test_the_axis_is_found_from_a_board_at_six_angles(tmp_path: Path) -> None:
     print(done.stdout)  # noqa: T201
     found = read_turntable(tmp_path / "turntable.json").axis
     assert found is not None
+    is_the_axis(found, axis)
+    # The same as a job, which turns the table itself.
+    head = board_head(tmp_path / "again", options, board_scene(more="rotation_deg = [20.0, 0.0, 0.0]"))
+    with board_rig(head, options) as rig:
+        monkeypatch.setattr(local, "open_rig", lambda _config: rig)
+        board = Board(BoardKind.CHARUCO, 6, 4, 26.0, 20.0, "DICT_4X4_50")
+        record = local.run_job(read_rig(CONFIG / "rigs" / "plane.toml"), AxisJob(board), lambda *_: None)
+    shot = (record.summary or {})["axis"]
+    again = MeasuredAxis(*(np.array(shot[name]) for name in ("point_mm", "direction", "covariance")))
+    is_the_axis(again, axis)
+
+
+def is_the_axis(found: MeasuredAxis, axis: RotationAxis) -> None:
+    """Within its own uncertainty, and that of this scene."""
     across = np.linalg.svd(found.direction[None])[2][1:]
     along = found.direction @ (found.point_mm - axis.point_mm) / (found.direction @ axis.direction)
     off_mm = np.linalg.norm(across @ (found.point_mm - axis.point_mm - along * axis.direction))
