@@ -17,6 +17,7 @@ from slrig.errors import (
     SlrigError,
     StorageError,
 )
+from slrig.printable import foreign_text
 
 UNEXPECTED = "unexpected"
 """The code of a failure that is a defect of slrig: its message is for people, its cause is in the service's log."""
@@ -65,12 +66,13 @@ def job_failure(error: BaseException) -> JobFailure:
     'storage'
     """
     if isinstance(error, SlrigError):
-        return JobFailure(error.code, str(error))
+        return JobFailure(error.code, foreign_text(error))
     if isinstance(error, MemoryError) or getattr(error, "code", None) == _OPENCV_NO_MEMORY:
-        message = f"The machine has too little memory for this: {error}. Free some, or use a camera of fewer pixels."
+        found = foreign_text(error)
+        message = f"The machine has too little memory for this: {found}. Free some, or use a camera of fewer pixels."
         return JobFailure(OutOfMemoryError.code, message)
     if isinstance(error, OSError) and error.errno in _DISK_REFUSALS:
-        return JobFailure(StorageError.code, disk_error_message(error, None))
+        return JobFailure(StorageError.code, foreign_text(disk_error_message(error, None)))
     message = (
         f"slrig met an error it did not expect ({type(error).__name__}). The service's log has the details under "
         "this job's id; please report them."

@@ -76,7 +76,7 @@ def load(group: str) -> Mapping[str, Any]:
     for entry in sorted(importlib.metadata.entry_points(group=group), key=lambda entry: entry.name):
         try:
             objects[entry.name] = entry.load()
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             package = "unknown" if entry.dist is None else entry.dist.name
             cause = f"{type(error).__name__}: {error}"
             message = (

@@ -16,6 +16,25 @@ unsafe = re.compile(rf"[{UNSAFE}\ud800-\udfff]")
 """The same, and half surrogate pairs, which JSON can hold and UTF-8 cannot."""
 
 
+_FOREIGN_LENGTH = 2000
+
+
+def foreign_text(value: object) -> str:
+    r"""Text of an object that somebody else's code made, such as an error: lines and tabs stay, other characters that
+    affect a terminal are escaped, and it has an end. An object without a text of its own gives its type.
+
+    >>> foreign_text(ValueError("a\x1b[2J\ud800\nb"))
+    'a\\u001b[2J\\ud800\nb'
+    """
+    try:
+        text = str(value)
+    except BaseException:  # noqa: BLE001 - of somebody else's class
+        text = type(value).__name__
+    lines = [[printable(part) for part in line.split("\t")] for line in text[: _FOREIGN_LENGTH + 1].split("\n")]
+    found = "\n".join("\t".join(parts) for parts in lines)
+    return found if len(text) <= _FOREIGN_LENGTH else f"{found[:_FOREIGN_LENGTH]} …"
+
+
 def printable(text: str) -> str:
     r"""Return the text with an escape for each character that affects a terminal or that UTF-8 cannot hold.
 

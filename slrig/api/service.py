@@ -165,6 +165,7 @@ class Service:
         self.presets = Presets(self.folder.root / "presets", presets or {})
         self.refuse_when_stale = refuse_when_stale
         self.hurry = threading.Event()
+        self._lasting: frozenset[str] = frozenset()
         database, outbox = self.store.database, self.store.outbox
         self.senders = senders_of(settings, outbox)
         self.keys = RequestKeys(database, life_s=settings.idempotency_keep_s)
@@ -230,7 +231,7 @@ class Service:
             self.durations.ended(record, events)
             for observer in self.observers:
                 observer.ended(record, events)
-        except Exception:  # noqa: BLE001 - the job is over, and on record, whatever becomes of its figures
+        except (Exception, SystemExit):  # noqa: BLE001 - the job is over, and on record, whatever becomes of its figures
             _log.exception("how long a job took could not be noted", job=str(record.id))
 
     def start(self) -> None:
@@ -241,7 +242,12 @@ class Service:
         self.scheduler.start()
         # It reads the report of every scan, and nobody waits for it.
         self.scan_retention.start()
+        self._lasting = _lasting_threads()
         threading.Thread(target=self.retention, name="slrig-retention", daemon=True).start()
+
+    def dead_threads(self) -> list[str]:
+        """Names of threads that have ended, and should last as long as the service."""
+        return [] if self.manager.ending else sorted(self._lasting - _lasting_threads())
 
     def drain(self) -> None:
         """Begin nothing new, and let what has the rig come to its end, as long as the settings allow, or until
@@ -269,6 +275,19 @@ class Service:
             observer.close()
         self.store.database.close()
         self.folder.release()
+
+
+def _lasting_threads() -> frozenset[str]:
+    """Names of the threads of this process that last as long as a service, as far as they live."""
+    names = {
+        "slrig-rig",
+        "slrig-watchdog",
+        "slrig-schedule",
+        "slrig-scan-retention",
+        "slrig-notices",
+        "slrig-catalogue",
+    }
+    return frozenset(names.intersection(each.name for each in threading.enumerate() if each.is_alive()))
 
 
 async def _of_request(request: Request) -> Service:

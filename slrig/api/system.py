@@ -6,7 +6,7 @@ import base64
 import hashlib
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -159,6 +159,7 @@ def readyz(service: Probed) -> Response | Probe:
         "disk": _storage(lambda: service.folder.require_space(service.settings.min_free_bytes)),
         "rig": _rig(status),
         "reconstruction": status.reconstruction,
+        "threads": _threads(service.dead_threads()),
     }
     if all(found == "ok" for found in checks.values()):
         return Probe(checks=checks)
@@ -185,6 +186,10 @@ def _storage(check: Callable[[], None]) -> str:
     except StorageError as error:
         return str(error)
     return "ok"
+
+
+def _threads(dead: Sequence[str]) -> str:
+    return f"{', '.join(dead)} ended by a defect: restart the service, and report its log" if dead else "ok"
 
 
 def _rig(status: RigStatus) -> str:

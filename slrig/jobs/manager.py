@@ -32,7 +32,7 @@ from slrig.errors import (
     SlrigError,
     StorageError,
 )
-from slrig.failure import UNEXPECTED, interruption_error, job_failure
+from slrig.failure import UNEXPECTED, JobFailure, interruption_error, job_failure
 from slrig.jobs.data_folder import DataFolder, missing_files
 from slrig.jobs.job import FrameFeed, Group, Job, JobRun, Outcome, ProgressRecorder, Recording, due_s
 from slrig.jobs.records import Holder, JobKind, JobRecord, JobState, acting_as, holder_of, utc_now, write_record
@@ -488,16 +488,22 @@ class JobManager:
     # The rig's thread
 
     def _own_rig(self) -> None:
+        """Body of the rig's thread. Nothing that a job or a driver raises ends it before the service ends."""
         error = self.rig.try_open()
         if isinstance(error, InvalidInputError):
             self._give_up(error)
         else:
             self._log_unopened(error)
-        while (work := self._next()) is not None:
+        while True:
             try:
+                work = self._next()
+                if work is None:
+                    break
                 self._run(work)
-            except Exception:  # noqa: BLE001 - the owner thread goes on after any failure of one job
-                _log.exception("the end of work with the rig went wrong", work=work.holder.words)
+            except BaseException:  # noqa: BLE001 - see above
+                _log.exception("the end of work with the rig went wrong")
+                # Not at once again, where that is what fails.
+                time.sleep(_LOOK_S)
         self.rig.darken()
         self.rig.let_go()
 
@@ -525,8 +531,8 @@ class JobManager:
                 with structlog.contextvars.bound_contextvars(job=str(work.id)):
                     self._capture(work)
                 error = None
-            except Exception as raised:  # noqa: BLE001 - the owner thread goes on after any failure of one job
-                error = interruption_error() if self._ending else raised
+            except BaseException as raised:  # noqa: BLE001 - the owner thread goes on after any failure of one job
+                error = interruption_error() if self._ending else _as_error(raised)
             finally:
                 self.rig.darken()
             goes_on = error is None and self._frees_rig(work)
@@ -596,7 +602,8 @@ class JobManager:
             rig = self.rig.open()
             with driver_errors(self.rig.name):
                 self._previews.run(rig, stop=self._wanted)
-        except Exception as error:  # noqa: BLE001 - the owner thread goes on after any failure of a preview
+        except BaseException as raised:  # noqa: BLE001 - the owner thread goes on after any failure of a preview
+            error = _as_error(raised)
             self.rig.let_go(error)
             self._log_unopened(error)
             fault = job_failure(error)
@@ -623,8 +630,8 @@ class JobManager:
                 with structlog.contextvars.bound_contextvars(job=str(work.id)):
                     work.outcome = self._computed(work)
                 error = None
-            except Exception as raised:  # noqa: BLE001 - it is the end of the job
-                error = interruption_error() if self._ending else raised
+            except BaseException as raised:  # noqa: BLE001 - it is the end of the job
+                error = interruption_error() if self._ending else _as_error(raised)
             self._clear_up(work, error)
         except Exception:  # noqa: BLE001 - as on the owner thread
             _log.exception("the end of work that computes went wrong", work=work.holder.words)
@@ -802,18 +809,32 @@ class JobManager:
                 made = self.store.finish(end.id, end.state, fault=end.outcome.fault, summary=end.outcome.summary)
             except JobNotFoundError:
                 made = False
-            except Exception as error:  # noqa: BLE001 - the end is not lost, whichever error refuses it
-                _log.error(
-                    "the end of a job could not be recorded",
-                    job=str(end.id), state=str(end.state), exc_info=not isinstance(error, StorageError),
-                    cause=str(error),
-                )  # fmt: skip
+            except StorageError as error:
+                _log.error("the end of a job could not be recorded", job=str(end.id), cause=str(error))
                 self._try_again()
                 continue
+            except Exception:  # noqa: BLE001 - the end is not lost, whichever error refuses it
+                _log.exception("the end of a job could not be recorded as it is", job=str(end.id), state=str(end.state))
+                plainly = self._ended_plainly(end)
+                if plainly is None:
+                    continue
+                made = plainly
             with self._changed:
                 self._ends = [each for each in self._ends if each is not end]
             if made:
                 _log.info("job finished", job=str(end.id), state=str(end.state))
+
+    def _ended_plainly(self, end: _End) -> bool | None:
+        """Record an end without its findings and cause, which cannot be recorded; None where that is refused, too."""
+        state = JobState.FAILED if end.state is JobState.SUCCEEDED else end.state
+        message = "What this job found cannot be put on record; the service's log has the details. Start it again."
+        try:
+            return self.store.finish(end.id, state, fault=JobFailure(UNEXPECTED, message))
+        except JobNotFoundError:
+            return False
+        except Exception:  # noqa: BLE001 - it is tried again
+            self._try_again()
+            return None
 
     def _try_again(self) -> None:
         def retry() -> None:
@@ -873,6 +894,15 @@ class JobManager:
         with self._changed:
             self._changed.wait_for(lambda: not self._computing, max(give_up - time.monotonic(), 0.0))
         self._cut_off(interruption_error(), self._under_way)
+
+
+def _as_error(raised: BaseException) -> Exception:
+    """What ended a job, as an error: the service's threads do not end by what a job raises, SystemExit among it."""
+    if isinstance(raised, Exception):
+        return raised
+    error = RuntimeError(f"{type(raised).__name__} ended it")
+    error.__cause__ = raised
+    return error
 
 
 def _goes_on(work: _Work, error: Exception) -> bool:

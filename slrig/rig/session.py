@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -207,14 +208,15 @@ class RigSession:
             rig: Rig | None = None
             try:
                 rig = self.calls.make(f"rig '{self.name}'", OPEN, OPEN_LIMIT_S, self._opened)
-                self.facts = _facts(rig)
+                self.settings = {}
+                opened = guarded(rig, self.calls, self.settings)
+                self.facts = self.calls.make(f"rig '{self.name}'", "info", OPEN_LIMIT_S, partial(_facts, opened))
             except Exception as error:
                 self.fault = job_failure(error)
                 if rig is not None:
                     self._close(rig)
                 raise
-            self.settings = {}
-            self._rig, self._bare = guarded(rig, self.calls, self.settings), rig
+            self._rig, self._bare = opened, rig
             if self._table_at is not None and isinstance(self._rig.positioner, Turntable):
                 table = CountedTurntable(self._rig.positioner, self._table_at)
                 self._rig = replace(self._rig, positioner=table)
@@ -325,7 +327,7 @@ class RigSession:
         def darken() -> None:
             try:
                 rig.projector.blank()
-            except Exception as error:  # noqa: BLE001 - nothing is left to be tried
+            except BaseException as error:  # noqa: BLE001 - nothing is left to be tried
                 _log.error("the projector may still be lit", rig=self.name, cause=repr(error))
 
         # On a thread of its own: a driver that hangs may hold back this call as well.

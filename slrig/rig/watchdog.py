@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Generic, TypeVar
 
+import numpy as np
 import structlog
 
 from slrig.capture import differs_from_request
@@ -44,6 +45,7 @@ from slrig.errors import (
     UnsupportedByDeviceError,
 )
 from slrig.model import Frame, PatternSequence, RotationAxis
+from slrig.printable import foreign_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,16 +171,21 @@ class Calls:
             self._note(error)
             raise
         except OSError as error:
-            told = _of_the_system(error, call)
-            self._note(told)
-            raise told from error
-        except Exception as error:
+            found = _of_the_system(error, call)
+            self._note(found)
+            raise found from error
+        except BaseException as error:
+            # Whatever a driver raises, sys.exit among it: this thread is the service's, and goes on.
+            if call.given_up:
+                self.failure = DeviceError(call.hangs())
+                raise self.failure from error
             # A driver may raise the same error again and again, and not every renderer bears the ring that this makes.
-            trace = "".join(traceback.format_exception(error))
+            trace = foreign_text("".join(_trace(error)))
             _log.error("a driver failed with an error of its own", device=device, step=step, exception=trace)
+            words = f"{type(error).__name__}: {foreign_text(error)}"
             message = (
-                f"{device}: its driver failed in {step} ({type(error).__name__}: {error}); scan again, and report it "
-                "to the driver's maintainer with the service's log"
+                f"{device}: its driver failed in {step} ({words}); scan again, and report it to the driver's "
+                "maintainer with the service's log"
             )
             self.failure = DriverBrokenError(message)
             raise self.failure from error
@@ -244,7 +251,10 @@ class Watchdog:
         while not self._ended.wait(self._look_s):
             call = self._calls.overdue()
             if call is not None:
-                self._on_hang(call)
+                try:
+                    self._on_hang(call)
+                except Exception:  # noqa: BLE001 - the watch over later calls goes on
+                    _log.exception("the end of a call that hangs went wrong", device=call.device, step=call.step)
 
 
 def guarded(rig: Rig, calls: Calls, settings: dict[str, SettingsInUse]) -> Rig:
@@ -260,10 +270,9 @@ def guarded(rig: Rig, calls: Calls, settings: dict[str, SettingsInUse]) -> Rig:
 
 
 def _guarded_projector(projector: Projector, calls: Calls) -> Projector:
-    name = f"projector '{projector.info.name}'"
     if isinstance(projector, UnknownPolarityProjector):
-        return _GuardedUnknownPolarityProjector(projector, name, calls)
-    return _GuardedProjector(projector, name, calls)
+        return _GuardedUnknownPolarityProjector(projector, calls)
+    return _GuardedProjector(projector, calls)
 
 
 def _guarded_positioner(positioner: Positioner | None, calls: Calls) -> GuardedPositioner | None:
@@ -284,9 +293,28 @@ class _Guarded(Generic[_Device]):
         self._made("close", self._device.close)
 
     def _made(self, step: str, function: Callable[[], _Value], *, limit_s: float | None = None) -> _Value:
-        limits = self._device.info.limits
+        limits = self._limits
         limit_s = limits.call_s if limit_s is None else limit_s
         return self._calls.make(self._name, step, limit_s, function, computed=limits.computed)
+
+    def _returned(
+        self, step: str, kind: type[_Value], function: Callable[[], object], *, limit_s: float | None = None
+    ) -> _Value:
+        """Make a call that must return a value of a kind; anything else is a defect of the driver."""
+
+        def checked() -> _Value:
+            value = function()
+            if not isinstance(value, kind):
+                message = f"it returned {foreign_text(repr(value))[:80]}, a {kind.__name__} is expected"
+                raise TypeError(message)
+            return value
+
+        return self._made(step, checked, limit_s=limit_s)
+
+    def _read_info(self, kind: type[_Value]) -> _Value:
+        """What the device declares; read once, as it does not change."""
+        self._limits = DEFAULT_LIMITS
+        return self._returned("info", kind, lambda: self._device.info)
 
 
 class _GuardedCamera(_Guarded[Camera]):
@@ -296,14 +324,12 @@ class _GuardedCamera(_Guarded[Camera]):
         super().__init__(camera, f"camera '{name}'", calls)
         self._key = name
         self._settings = settings
-
-    @property
-    def info(self) -> CameraInfo:
-        return self._device.info
+        self.info = self._read_info(CameraInfo)
+        self._limits = self.info.limits
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         try:
-            applied = self._made("configure", lambda: self._device.configure(settings))
+            applied = self._returned("configure", AppliedSettings, lambda: self._device.configure(settings))
         except UnsupportedByDeviceError as error:
             before = self._settings.get(self._key)
             kept = None if before is None else before.applied
@@ -319,25 +345,56 @@ class _GuardedCamera(_Guarded[Camera]):
         self._made("trigger", self._device.trigger)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
-        limit_s = 2 * timeout_s + self._device.info.limits.read_slack_s
-        return self._made("read", lambda: self._device.read(after_ns, timeout_s), limit_s=limit_s)
+        limit_s = 2 * timeout_s + self._limits.read_slack_s
+
+        def read() -> Frame:
+            frame = self._device.read(after_ns, timeout_s)
+            _require_possible(frame)
+            return frame
+
+        return self._returned("read", Frame, read, limit_s=limit_s)
 
     def disarm(self) -> None:
         self._made("disarm", self._device.disarm)
 
 
+def _require_possible(frame: object) -> None:
+    """Raise ValueError for times and counts that no camera has."""
+    if not isinstance(frame, Frame):
+        return
+    counts: tuple[object, ...] = (
+        frame.t_start_ns, frame.t_end_ns, frame.t_err_ns, frame.sequence_number, frame.dropped_count
+    )  # fmt: skip
+    whole = all(isinstance(each, int | np.integer) and abs(int(each)) < 2**62 for each in counts)
+    if not whole or frame.t_end_ns < frame.t_start_ns or frame.t_err_ns < 0 or not 0 <= frame.dropped_count < 2**31:
+        message = (
+            f"it returned a frame from {frame.t_start_ns} to {frame.t_end_ns} ns ± {frame.t_err_ns}, number "
+            f"{frame.sequence_number}, {frame.dropped_count} lost before, which no exposure has"
+        )
+        raise ValueError(message)
+
+
 class _GuardedProjector(_Guarded[Projector]):
     """Implements `slrig.devices.Projector` by another one."""
 
-    @property
-    def info(self) -> ProjectorInfo:
-        return self._device.info
+    def __init__(self, projector: Projector, calls: Calls) -> None:
+        super().__init__(projector, "projector", calls)
+        self.info = self._read_info(ProjectorInfo)
+        self._limits = self.info.limits
+        self._name = f"projector '{foreign_text(self.info.name)}'"
 
     def load(self, sequence: PatternSequence) -> None:
         self._made("load", lambda: self._device.load(sequence))
 
     def show(self, index: int) -> DisplayedPattern:
-        return self._made("show", lambda: self._device.show(index))
+        def show() -> object:
+            shown: object = self._device.show(index)
+            if isinstance(shown, DisplayedPattern) and not (shown.index == index and shown.t_err_ns >= 0):
+                message = f"asked for pattern {index}, it returned {shown}"
+                raise ValueError(message)
+            return shown
+
+        return self._returned("show", DisplayedPattern, show)
 
     def play(self, exposure_s: float, period_s: float) -> None:
         self._made("play", lambda: self._device.play(exposure_s, period_s))
@@ -352,8 +409,8 @@ class _GuardedProjector(_Guarded[Projector]):
 class _GuardedUnknownPolarityProjector(_GuardedProjector):
     """Implements `slrig.devices.UnknownPolarityProjector` by another one."""
 
-    def __init__(self, projector: UnknownPolarityProjector, name: str, calls: Calls) -> None:
-        super().__init__(projector, name, calls)
+    def __init__(self, projector: UnknownPolarityProjector, calls: Calls) -> None:
+        super().__init__(projector, calls)
         self._projector = projector
 
     @property
@@ -417,6 +474,13 @@ class GuardedTurntable(GuardedPositioner):
     def turn(self, angle_deg: float) -> None:
         """See `Turntable`."""
         self._made("turn", MOVE_LIMIT_S, lambda: self._turntable.turn(angle_deg))
+
+
+def _trace(error: BaseException) -> list[str]:
+    try:
+        return traceback.format_exception(error)
+    except BaseException:  # noqa: BLE001 - of a class that has no text
+        return [type(error).__name__]
 
 
 def _of_the_system(error: OSError, call: Call) -> DeviceError:

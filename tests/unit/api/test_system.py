@@ -122,7 +122,7 @@ def test_probes_say_what_is_missing(client: TestClient, served: ServedBench, mon
     ended(client, client.post("/scan").json()["id"])
     assert client.get("/livez").json()["checks"] == {"process": "ok"}
     assert client.get("/readyz").json() == {
-        "checks": {"records": "ok", "disk": "ok", "rig": "ok", "reconstruction": "ok"},
+        "checks": {"records": "ok", "disk": "ok", "rig": "ok", "reconstruction": "ok", "threads": "ok"},
         "pending": [],
     }
     served.free_bytes = 10

@@ -52,7 +52,7 @@ class Steps:
     where it captured; rigs : with what. While `gate` is clear it captures, and `began` is set when it does.
     """
 
-    capture_error: Exception | None = None
+    capture_error: BaseException | None = None
     recording_error: Exception | None = None
     compute_error: Exception | None = None
     keep_error: Exception | None = None
@@ -68,7 +68,7 @@ class Steps:
         self.gate, self.began = threading.Event(), threading.Event()
         self.gate.set()
 
-    def does(self, name: str, error: Exception | None = None) -> None:
+    def does(self, name: str, error: BaseException | None = None) -> None:
         self.done.append(name)
         if error is not None:
             raise error
@@ -90,7 +90,7 @@ class SteppedJob(Job):
     def steps(self) -> Steps:
         return STEPS[self.name]
 
-    def capture(self, rig: RigSession, run: JobRun) -> Recording:
+    def capture(self, rig: RigSession, run: JobRun) -> Recording | Outcome:
         steps, opened = self.steps, rig.open()
         steps.threads.append(threading.current_thread().name)
         steps.rigs.append(opened)
@@ -121,6 +121,18 @@ class Measuring(SteppedJob):
     """The same, over when the rig is free."""
 
     computes: ClassVar[bool] = False
+
+
+@dataclass(frozen=True, slots=True)
+class Finding(Measuring):
+    """One that has its outcome when the rig is free."""
+
+    def capture(self, rig: RigSession, run: JobRun) -> Outcome:
+        del rig, run
+        return self.steps.outcome
+
+    def place(self, data: DataFolder, job_id: UUID) -> None:  # type: ignore[override] # it keeps no files
+        del data, job_id
 
 
 class Listening:
@@ -185,6 +197,30 @@ def test_rig_is_used_on_its_owner_thread_and_dark_afterwards(bench: Bench) -> No
     assert bench.manager.status().holder is None
     assert bench.until(bench.scan().id).state is JobState.SUCCEEDED
     assert len(bench.opened) == 1
+
+
+@pytest.mark.parametrize("raised", [SystemExit(3), KeyboardInterrupt(), RuntimeError("odd \udcff")], ids=repr)
+def test_the_rig_goes_on_whatever_a_job_raises(bench: Bench, raised: BaseException) -> None:
+    work = Steps(capture_error=raised)
+    with capture_logs():
+        record = bench.until(measuring(bench, work))
+    assert record.state is JobState.FAILED
+    assert record.fault is not None
+    assert bench.manager.status().holder is None
+    assert bench.until(bench.scan(wait=True).id).state is JobState.SUCCEEDED
+
+
+def test_an_end_that_cannot_be_recorded_as_it_is_is_recorded_plainly(bench: Bench) -> None:
+    with capture_logs() as logs:
+        record = bench.until(measured_as(bench, {"odd": "\udcff", "worse": object()}))
+    assert (record.state, failure_code(record)) == (JobState.FAILED, "unexpected")
+    assert "cannot be put on record" in (record.fault or REFUSED).message
+    assert "could not be recorded as it is" in str(logs)
+
+
+def measured_as(bench: Bench, summary: Mapping[str, Any]) -> UUID:
+    """A job with a summary that JSON cannot hold."""
+    return bench.manager.submit(stepped(Steps(outcome=Outcome(summary)), Finding))[0].id
 
 
 def test_jobs_of_all_kinds_wait_in_one_line(bench: Bench) -> None:

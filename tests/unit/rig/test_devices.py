@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 import errno
+import math
+import re
 import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from slrig.devices import AppliedSettings, CallLimits, CameraSettings, Rig, Trigger, TurntableBase, progress_reporter
+from slrig.devices import (
+    AppliedSettings,
+    CallLimits,
+    CameraSettings,
+    DisplayedPattern,
+    Rig,
+    Trigger,
+    TurntableBase,
+    progress_reporter,
+)
 from slrig.errors import (
     CameraNotFoundError,
     ConfigError,
@@ -27,7 +39,7 @@ from slrig.errors import (
     StorageError,
     UnsupportedByDeviceError,
 )
-from slrig.model import RotationAxis
+from slrig.model import Frame, RotationAxis
 from slrig.rig.preview import Light, Picture, Previews, Watch
 from slrig.rig.session import FROM_THE_START, CountedTurntable, RigSession
 from slrig.rig.watchdog import (
@@ -46,7 +58,7 @@ from tests.unit.scan.bench import Bench
 from tests.unit.scan.fakes import WAIT_S, TameBench, TameCamera, TameProjector
 
 
-def failing(error: Exception) -> Callable[[], None]:
+def failing(error: BaseException) -> Callable[[], None]:
     def call() -> None:
         raise error
 
@@ -224,10 +236,77 @@ def test_every_call_of_a_device_is_guarded(monkeypatch: pytest.MonkeyPatch) -> N
             call()
     rig.projector.stop()
     assert rig.close() == ()
-    steps = ["configure", "arm", "trigger", "read", "disarm"]
+    steps = ["info", "configure", "arm", "trigger", "read", "disarm"]
     assert [step for step in made if "camera" in step] == [f"camera 'cam0' {step}" for step in [*steps, "close"]]
     shown = ["show", "play", "stop", "blank", "close"]
-    assert [step for step in made if "projector" in step] == [f"projector 'projector' {step}" for step in shown]
+    assert [step for step in made if "projector" in step] == [
+        "projector info",
+        *(f"projector 'projector' {step}" for step in shown),
+    ]
+
+
+class WordlessError(Exception):
+    """An error that has no text."""
+
+    def __str__(self) -> str:
+        raise SystemExit(3)
+
+
+@pytest.mark.parametrize(
+    ("raised", "words"),
+    [
+        (SystemExit(3), "SystemExit: 3"),
+        (KeyboardInterrupt(), "KeyboardInterrupt: )"),
+        (GeneratorExit(), "GeneratorExit: )"),
+        (RuntimeError("/dev/cam\udcff\x1b[2J"), "RuntimeError: /dev/cam\\udcff\\u001b[2J)"),
+        (WordlessError(), "WordlessError: WordlessError)"),
+        (ValueError("x" * 10**6), " …)"),
+    ],
+    ids=lambda each: type(each).__name__,
+)
+def test_whatever_a_driver_raises_is_a_defect_of_the_driver_in_words(raised: BaseException, words: str) -> None:
+    calls = Calls()
+    with capture_logs(), pytest.raises(DriverBrokenError) as told:
+        calls.make("camera 'cam0'", "read", 1.0, failing(raised))
+    text = str(told.value)
+    assert words in text
+    assert len(text) < 3000
+    text.encode("utf-8")
+    assert calls.failure is told.value
+
+
+@pytest.mark.parametrize(
+    ("step", "returned", "words"),
+    [
+        ("read", None, "returned None, a Frame is expected"),
+        ("read", {"t_start_ns": 5, "t_end_ns": 4}, "from 5 to 4 ns"),
+        ("read", {"t_err_ns": -5}, "± -5"),
+        ("read", {"dropped_count": 2**40}, f"{2**40} lost before"),
+        ("read", {"t_end_ns": math.inf}, "to inf ns"),
+        ("configure", 3, "returned 3, a AppliedSettings is expected"),
+        ("info", None, "returned None, a CameraInfo is expected"),
+        ("show", DisplayedPattern(7, 0, 0), "asked for pattern 3"),
+    ],
+)
+def test_values_that_no_device_has_are_a_defect_of_the_driver(step: str, returned: Any, words: str) -> None:
+    camera, projector = TameCamera(), TameProjector()
+    frame = Frame("cam0", np.zeros((2, 2), np.uint8), 0, 1, 0, 1, 0, 0.01, 1.0)
+    value = replace(frame, **returned) if isinstance(returned, dict) else returned
+    device = projector if step == "show" else camera
+    setattr(device, step, value if step == "info" else lambda *_: value)
+
+    def used() -> None:
+        rig = guarded(Rig("bench", {"cam0": camera}, projector, {}), Calls(), {})
+        eye = rig.cameras["cam0"]
+        calls: dict[str, Callable[[], object]] = {
+            "read": lambda: eye.read(0, 1.0),
+            "configure": lambda: eye.configure(CameraSettings(0.01)),
+            "show": lambda: rig.projector.show(3),
+        }
+        calls[step]()
+
+    with capture_logs(), pytest.raises(DriverBrokenError, match=re.escape(words)):
+        used()
 
 
 def test_settings_are_kept_as_applied_with_what_was_refused_or_bent() -> None:
