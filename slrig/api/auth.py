@@ -10,7 +10,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Literal
@@ -108,8 +108,12 @@ class KeyRing:
 
     def find(self, sent: str) -> Key | None:
         """The key that somebody sent, if it is one, whether or not it still opens anything."""
+        return self.by_digest(digest(sent))
+
+    def by_digest(self, identity: str) -> Key | None:
+        """The key of a digest, which is its identity: a name may pass on to another key."""
         self._look()
-        return self._by_digest.get(digest(sent))
+        return self._by_digest.get(identity)
 
     def named(self, name: str) -> Key | None:
         """The newest key of a name."""
@@ -233,16 +237,19 @@ SESSION_LIFE = timedelta(hours=12)
 """A working day."""
 LINK_LIFE = timedelta(minutes=15)
 MOST_SESSIONS = 256
-"""The oldest goes when there are more."""
+"""Of all keys together."""
+MOST_OF_KEY = 16
+"""Sessions of one key: a person with a few browsers."""
 
 router = APIRouter(prefix="/session", tags=["session"])
 
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """One browser that is logged in: by whose key, and until when. ends : what is left when that key ends."""
+    """One browser that is logged in. name, key : of the key that it is logged in by, the latter its digest."""
 
     name: str
+    key: str
     expires_at: datetime
 
 
@@ -259,22 +266,36 @@ class Sessions:
 
     def link(self, name: str) -> str:
         """A secret that opens one session by the key of a name."""
-        secret = secrets.token_urlsafe(32)
-        self._links[digest(secret)] = Session(name, self._clock() + LINK_LIFE)
+        secret, key = secrets.token_urlsafe(32), self.ring.named(name)
+        self._links[digest(secret)] = Session(name, "" if key is None else key.digest, self._clock() + LINK_LIFE)
         return secret
 
     def follow(self, secret: str) -> tuple[str, Session] | None:
-        """Open the session of a link, once; None where it was followed before, or is too old."""
-        link = self._links.pop(digest(secret), None)
-        return None if link is None or link.expires_at <= self._clock() else self.open(link.name)
+        """Open the session of a link, once; None where it was followed before, is too old, or its key has ended."""
+        link, now = self._links.pop(digest(secret), None), self._clock()
+        key = None if link is None or link.expires_at <= now else self.ring.by_digest(link.key)
+        return None if key is None or key.fault(now) is not None else self.open(key.name, key.digest)
 
-    def open(self, name: str) -> tuple[str, Session]:
-        """Open a session by the key of a name: the secret for the cookie, and what it stands for."""
+    def open(self, name: str, key: str) -> tuple[str, Session]:
+        """Open a session by a key: the secret for the cookie, and the session. A key has `MOST_OF_KEY` of them at once;
+        its oldest ends for another one.
+
+        Raises
+        ------
+        Refused
+            As many sessions are open as may, of all keys together.
+        """
+        now = self._clock()
+        self._open = OrderedDict((each, session) for each, session in self._open.items() if session.expires_at > now)
+        own = [each for each, session in self._open.items() if session.key == key]
+        for each in own[: max(len(own) - MOST_OF_KEY + 1, 0)]:
+            del self._open[each]
+        if len(self._open) >= MOST_SESSIONS:
+            detail = f"{len(self._open)} browsers are logged in, as many as may. Log out in one that is not used."
+            raise Refused(429, "too-many-requests", detail, {"Retry-After": "60"})
         secret = secrets.token_urlsafe(32)
-        session = Session(name, self._clock() + SESSION_LIFE)
+        session = Session(name, key, now + SESSION_LIFE)
         self._open[digest(secret)] = session
-        while len(self._open) > MOST_SESSIONS:
-            self._open.popitem(last=False)
         return secret, session
 
     def find(self, secret: str) -> Session | None:
@@ -309,7 +330,10 @@ async def open_session(request: Request, response: Response) -> SessionBody:
     sessions: Sessions | None = request.app.state.sessions
     if sessions is None:
         raise HTTPException(409, "This service asks nobody for a key, so there is nothing to log in to.")
-    secret, session = sessions.open(caller.name)
+    try:
+        secret, session = sessions.open(caller.name, caller.key)
+    except Refused as refusal:
+        raise HTTPException(refusal.status, str(refusal), refusal.headers) from refusal
     _set_cookie(request, response, sessions, secret)
     return SessionBody(name=caller.name, scopes=caller.scopes, expires_at=session.expires_at)
 
@@ -370,7 +394,7 @@ _JSON_TYPES = frozenset({"application/json", "application/problem+json"})
 _BURST_S = 4.0
 """How many seconds' worth of requests may come at once: a page with its pictures."""
 _MOST_COUNTED = 1024
-_LOOK_AGAIN_S = 10.0
+_LOOK_AGAIN_S = 5.0
 """How long a stream may go on that was begun with a key that has been revoked, or has expired, since then."""
 
 _log = structlog.get_logger(__name__)
@@ -378,11 +402,14 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who sent a request, what their key is for, and until when it, or their session, is good."""
+    """Who sent a request, what their key is for, and until when it, or their session, is good. key : its digest, ""
+    where nobody is asked for one.
+    """
 
     name: str
     scopes: tuple[KeyScope, ...] = ALL_SCOPES
     expires_at: datetime | None = None
+    key: str = ""
 
 
 class Access:
@@ -420,7 +447,10 @@ class Access:
             refuse_foreign_page(headers, method, path, by_cookie=not by_key and "cookie" in headers)
             refuse_other_types(headers, method, path)
             caller = self._caller(headers, path)
-            self._rates.count(address if caller is None else caller.name)
+            if caller is None:
+                self._rates.count(address, address)
+            else:
+                self._rates.count(caller.key, caller.name)
             if caller is not None:
                 refuse_out_of_scope(caller, needed_scope(method, path))
         except Refused as refusal:
@@ -446,7 +476,7 @@ class Access:
 
         name = ANYONE if caller is None else caller.name
         try:
-            with acting_as(name):
+            with acting_as(name, key="" if caller is None else caller.key):
                 await self._app(scope, receive, noted)
         except Exception:
             if not is_over:
@@ -476,8 +506,8 @@ class Access:
         cookie = cookie_parser(headers.get("cookie", "")).get(sessions.cookie)
         session = None if cookie is None else sessions.find(cookie)
         if session is not None:
-            owner = _let_in(ring.named(session.name))
-            return Caller(owner.name, owner.scopes, session.expires_at)
+            owner = _let_in(ring.by_digest(session.key))
+            return replace(owner, expires_at=session.expires_at)
         raise _unauthorized("none" if cookie is None else "a session that is over")
 
     async def _refuse(
@@ -494,7 +524,7 @@ class Access:
         if refusal.status == 401:
             # Strangers are not put on record: they could fill the disk with it.
             try:
-                self._rates.count(address)
+                self._rates.count(address, address)
             except Refused as too_many:
                 refusal = too_many
         elif caller is not None:
@@ -566,7 +596,7 @@ def _let_in(key: Key | None) -> Caller:
     fault = key.fault(utc_now())
     if fault is not None:
         raise _unauthorized(f"one that {fault}")
-    return Caller(key.name, key.scopes, key.expires_at)
+    return Caller(key.name, key.scopes, key.expires_at, key.digest)
 
 
 def _unauthorized(found: str) -> Refused:
@@ -596,15 +626,16 @@ def _sent_key(headers: Headers) -> str | None:
 
 
 class Rates:
-    """How many requests each name may send: so many a second, and a few seconds' worth at once (a token bucket).
+    """How many requests each key, or address without one, may send: so many a second, and a few seconds' worth at once
+    (a token bucket).
 
     >>> rates = Rates(1, clock=lambda: 0.0)
-    >>> for _ in range(4): rates.count("ann")
-    >>> rates.count("ann")
+    >>> for _ in range(4): rates.count("key of ann", "ann")
+    >>> rates.count("key of ann", "ann")
     Traceback (most recent call last):
     ...
     slrig.api.auth.Refused: 'ann' sends more than 1 requests a second. Wait a second, then send fewer.
-    >>> rates.count("bob")
+    >>> rates.count("key of bob", "bob")
     """
 
     def __init__(self, per_second: float, *, clock: Callable[[], float] = time.monotonic) -> None:
@@ -612,14 +643,14 @@ class Rates:
         self._clock = clock
         self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
-    def count(self, name: str) -> None:
-        """Count one request. Raises Refused: it is one too many."""
+    def count(self, sender: str, name: str) -> None:
+        """Count one request of a sender, called so in the refusal. Raises Refused: it is one too many."""
         now = self._clock()
         most = max(self._per_second * _BURST_S, 1.0)
-        left, since = self._left.pop(name, (most, now))
+        left, since = self._left.pop(sender, (most, now))
         left = min(left + (now - since) * self._per_second, most)
         allowed = left >= 1.0
-        self._left[name] = (left - 1.0 if allowed else left, now)
+        self._left[sender] = (left - 1.0 if allowed else left, now)
         if len(self._left) > _MOST_COUNTED:
             self._left.popitem(last=False)
         if not allowed:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -56,18 +57,26 @@ class OpenStreams:
 
     limit: int
     count: int = 0
+    of_keys: Counter[str] = field(default_factory=Counter)
     followed: dict[UUID, SharedLooks] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
 class Place:
-    """A request's place among the open streams, once it is taken."""
+    """A request's place among the open streams, once it is taken. key : digest of the sender's key; one key has half of
+    all places at most.
+    """
 
     streams: OpenStreams
+    key: str = ""
     taken: bool = False
 
     def take(self) -> None:
         """Count as open from now until the answer is over. Raises HTTPException 429: as many are open as may."""
+        share = max(self.streams.limit // 2, 1)
+        if self.key and self.streams.of_keys[self.key] >= share:
+            detail = f"{share} streams of this key are open, as many as one key may have. Close one."
+            raise HTTPException(429, detail, headers={"Retry-After": "5"})
         if self.streams.count >= self.streams.limit:
             detail = (
                 f"{self.streams.count} streams of events or pictures are open, as many as may. Close one, or ask for "
@@ -75,16 +84,25 @@ class Place:
             )
             raise HTTPException(429, detail, headers={"Retry-After": "5"})
         self.streams.count += 1
+        self.streams.of_keys[self.key] += 1
         self.taken = True
+
+    def leave(self) -> None:
+        """Count as open no longer."""
+        if self.taken:
+            self.streams.count -= 1
+            self.streams.of_keys[self.key] -= 1
+            self.streams.of_keys += Counter()
 
 
 async def _place(request: Request) -> AsyncIterator[Place]:
-    place = Place(request.app.state.streams)
+    caller = getattr(request.state, "caller", None)
+    place = Place(request.app.state.streams, "" if caller is None else caller.key)
     try:
         yield place
     finally:
         # The answer is over, also one whose client was gone before it began.
-        place.streams.count -= place.taken
+        place.leave()
 
 
 StreamPlace = Annotated[Place, Depends(_place)]

@@ -25,7 +25,17 @@ from slrig.catalogue.store import Copier, catalogue_of, standing
 from slrig.config import ServiceSettings
 from slrig.doctor import EXAMINATIONS, Examinations
 from slrig.jobs.manager import JobManager
-from slrig.jobs.records import RIG_JOBS, JobEvent, JobKind, JobProgress, JobRecord, JobState, stages_of, utc_now
+from slrig.jobs.records import (
+    RIG_JOBS,
+    JobEvent,
+    JobKind,
+    JobProgress,
+    JobRecord,
+    JobState,
+    actor_key,
+    stages_of,
+    utc_now,
+)
 from slrig.jobs.resume import resume
 from slrig.jobs.store import Audit, AuditEntry, JobStore, RequestKeys
 from slrig.model_jobs.job import TURNTABLE, Models, ViewShooting
@@ -389,8 +399,8 @@ def started_once(
 
 
 def own_key(key: str, path: str) -> str:
-    """A key as it is on record: that of the requests to one path."""
-    return f"{path} {key}"
+    """An idempotency key as it is on record: that of the requests to one path with one API key."""
+    return " ".join(filter(None, (actor_key()[:16], path, key)))
 
 
 def fingerprint(request: BaseModel) -> str:

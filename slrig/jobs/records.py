@@ -31,16 +31,25 @@ def utc_now() -> datetime:
 
 
 _actor: ContextVar[str | None] = ContextVar("actor", default=None)
+_actor_key: ContextVar[str] = ContextVar("actor_key", default="")
 
 
 @contextmanager
-def acting_as(name: str | None) -> Iterator[None]:
-    """Jobs that are made within the block, on this thread or one that it waits for, were asked for by `name`."""
-    before = _actor.set(name)
+def acting_as(name: str | None, *, key: str = "") -> Iterator[None]:
+    """Jobs that are made within the block, on this thread or one that it waits for, were asked for by `name`. key :
+    digest of the key that they were asked for with; "" where there is none.
+    """
+    before, before_key = _actor.set(name), _actor_key.set(key)
     try:
         yield
     finally:
         _actor.reset(before)
+        _actor_key.reset(before_key)
+
+
+def actor_key() -> str:
+    """Digest of the key that what is being made now is asked for with; "" where there is none."""
+    return _actor_key.get()
 
 
 def actor() -> str | None:

@@ -14,6 +14,7 @@ import pytest
 from fastapi.responses import StreamingResponse
 from fastapi.testclient import TestClient
 from sse_starlette import EventSourceResponse
+from starlette.exceptions import HTTPException
 from starlette.types import Receive, Send
 from starlette.types import Scope as ASGIScope
 
@@ -25,6 +26,7 @@ from slrig.api.auth import (
     FIRST_NAME,
     GIVEN_NAME,
     LINK_PATH,
+    MOST_OF_KEY,
     Access,
     Key,
     KeyRing,
@@ -33,6 +35,7 @@ from slrig.api.auth import (
     Sessions,
     first_key,
 )
+from slrig.api.events import OpenStreams, Place
 from slrig.api.problems import _CODES, explanations, text
 from slrig.api.scopes import READING, KeyScope, needed_scope
 from slrig.api.server import _keys
@@ -428,14 +431,60 @@ def test_the_link_works_once_and_not_for_long(served: ServedBench, monkeypatch: 
 
 
 @pytest.mark.usefixtures("client")
+def test_one_key_shuts_nobody_out(served: ServedBench, ring: KeyRing, monkeypatch: pytest.MonkeyPatch) -> None:
+    mine = logged_in(served)
+    greedy = {"Authorization": f"Bearer {ring.add('Ann', [])}"}
+    cookies = [stranger(served).post("/session", headers=greedy).headers["set-cookie"] for _ in range(MOST_OF_KEY + 1)]
+    assert mine.get("/scan").status_code == 200
+    answers = [stranger(served).get("/scan", headers={"Cookie": each.partition(";")[0]}) for each in cookies]
+    known = [each.status_code for each in answers]
+    # Its own oldest has ended.
+    assert known == [401, *[200] * MOST_OF_KEY]
+    monkeypatch.setattr(access, "MOST_SESSIONS", MOST_OF_KEY + 1)
+    bob = {"Authorization": f"Bearer {ring.add('Bob', [])}"}
+    refused = stranger(served).post("/session", headers=bob)
+    assert (refused.status_code, refused.headers["Retry-After"]) == (429, "60")
+    for each in ("Ann", "Bob"):
+        ring.revoke(each)
+
+
+def test_streams_and_idempotency_keys_belong_to_a_key(served: ServedBench, ring: KeyRing, client: TestClient) -> None:
+    streams = OpenStreams(4)
+    places = [Place(streams, "ann") for _ in range(3)]
+    for each in places[:2]:
+        each.take()
+    with pytest.raises(HTTPException, match="of this key"):
+        places[2].take()
+    Place(streams, "bob").take()
+    places[0].leave()
+    places[2].take()
+    assert (streams.count, streams.of_keys) == (3, {"ann": 2, "bob": 1})
+    # Two programs that count 1, 2, 3 do not take each other's scans.
+    ann = stranger(served, ring.add("Ann", [KeyScope.SCAN]))
+    mine = client.post("/scan", headers={"Idempotency-Key": "1"}).json()
+    ended(client, mine["id"])
+    hers = ann.post("/scan", headers={"Idempotency-Key": "1"}).json()
+    assert hers["id"] != mine["id"]
+    assert ann.post("/scan", headers={"Idempotency-Key": "1"}).json()["id"] == hers["id"]
+    ended(client, hers["id"])
+    ring.revoke("Ann")
+
+
+@pytest.mark.usefixtures("client")
 def test_a_session_ends_with_its_time_and_with_its_key(
     served: ServedBench, ring: KeyRing, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     browser = stranger(served)
     browser.post("/session", headers={"Authorization": f"Bearer {ring.add('Ann', [])}"})
     assert browser.get("/scan").status_code == 200
+    link = sessions(served).link("Ann")
     ring.revoke("Ann")
     assert browser.get("/scan").status_code == 401
+    # Nor do session and link live again with the next key of that name, which may do more.
+    ring.add("Ann", list(KeyScope))
+    assert browser.get("/scan").status_code == 401
+    assert stranger(served).get(f"{LINK_PATH}?token={link}", follow_redirects=True).status_code == 401
+    ring.revoke("Ann")
     other = logged_in(served)
     now = sessions(served)._clock()
     monkeypatch.setattr(sessions(served), "_clock", lambda: now + timedelta(hours=12))
@@ -523,17 +572,17 @@ def test_rates_come_back_with_time_and_forget_the_oldest(monkeypatch: pytest.Mon
     now = 0.0
     rates = Rates(2, clock=lambda: now)
     for _ in range(8):
-        rates.count("ann")
+        rates.count("ann", "ann")
     with pytest.raises(Refused):
-        rates.count("ann")
+        rates.count("ann", "ann")
     now = 1.0
-    rates.count("ann")
-    rates.count("ann")
+    rates.count("ann", "ann")
+    rates.count("ann", "ann")
     with pytest.raises(Refused):
-        rates.count("ann")
+        rates.count("ann", "ann")
     monkeypatch.setattr(access, "_MOST_COUNTED", 10)
     for number in range(100):
-        rates.count(f"name {number}")
+        rates.count(f"name {number}", f"name {number}")
     assert len(rates._left) <= 10
 
 
