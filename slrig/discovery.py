@@ -13,6 +13,9 @@ files, and loads neither the driver nor its vendor's library.
 from __future__ import annotations
 
 import importlib.metadata
+import math
+import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -44,6 +47,7 @@ from slrig.errors import (
     DriverBrokenError,
     DriverNotFoundError,
     LibraryMissingError,
+    RigBusyError,
     SlrigError,
     WrongSystemError,
 )
@@ -139,6 +143,42 @@ def discover_devices() -> DiscoveredDevices:
             message = f"finder '{entry.name}' failed: {error}"
             faults.append(DriverBrokenError(message))
     return DiscoveredDevices(tuple(devices), tuple(missing), tuple(faults), tuple(elsewhere))
+
+
+_FRESH_S = 5.0
+"""How old the result of a search for devices may be."""
+
+
+class DeviceSearch:
+    """The search for devices, which touches hardware: one at a time, whose result all get who wait for it."""
+
+    def __init__(self, *, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._now_s = now_s
+        self._lock = threading.Lock()
+        self._found: DiscoveredDevices | None = None
+        self._found_s = -math.inf
+
+    def found(self, holder: str | None) -> DiscoveredDevices:
+        """What is plugged in, some seconds old at most. holder : who holds the rig; the last result stands meanwhile.
+
+        Raises RigBusyError: the rig is held, and no search was made before.
+        """
+        if holder is not None:
+            if self._found is None:
+                message = (
+                    f"The rig is held by {holder}, and a search for devices would disturb it. Ask again when that "
+                    "is over."
+                )
+                raise RigBusyError(message, holder=holder, since="")
+            return self._found
+        asked_s = self._now_s()
+        with self._lock:
+            # One that was begun after this request, or a moment before it, is its search, too.
+            if self._found is None or asked_s - self._found_s > _FRESH_S:
+                begun_s = self._now_s()
+                self._found = discover_devices()
+                self._found_s = begun_s
+            return self._found
 
 
 def open_rig(config: RigConfig) -> Rig:

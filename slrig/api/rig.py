@@ -48,7 +48,7 @@ from slrig.calibration.health import THRESHOLDS, DriftEstimate, HealthState, Pai
 from slrig.capture import DEFAULT_SEARCH_S, DEFAULT_TRIALS
 from slrig.conformance import ConformanceJob
 from slrig.devices import CameraInfo, FoundDevice, Trigger
-from slrig.discovery import InstalledDriver, MissingLibrary, OtherSystem, discover_devices, installed_drivers
+from slrig.discovery import InstalledDriver, MissingLibrary, OtherSystem, installed_drivers
 from slrig.doctor import DoctorJob, Examination, LatencyJob, last_examination
 from slrig.errors import CalibrationError, CalibrationStateError, ConfigError, ScanStateError, SlrigError
 from slrig.jobs.job import Job
@@ -115,10 +115,12 @@ class DeviceList(BaseModel):
     faults: list[str]
 
 
-@router.get("/device")
-def list_devices() -> DeviceList:
-    """Return the drivers that are installed, the devices that are plugged in, and the libraries that are missing."""
-    found = discover_devices()
+@router.get("/device", responses=problems(409))
+def list_devices(service: Serving) -> DeviceList:
+    """Return the drivers that are installed, the devices that are plugged in, and the libraries that are missing. While
+    the rig is held, those that were plugged in before.
+    """
+    found = service.devices.found(service.manager.status().holder)
     return filled(DeviceList, found, drivers=installed_drivers(), faults=[str(fault) for fault in found.faults])
 
 

@@ -511,7 +511,8 @@ def _tell_preparation(service: Service, say: Callable[[str], None], ended: threa
 
 
 def _keys(settings: ServiceSettings, *, fresh: bool) -> KeyRing:
-    given = os.environ.get(KEY_VARIABLE)
+    # It is not for the processes that the service starts.
+    given = os.environ.pop(KEY_VARIABLE, None)
     if given and fresh:
         message = f"--new-key asks for a new key, and {KEY_VARIABLE} holds the one to use. Leave out one of the two."
         raise ConfigError(message)

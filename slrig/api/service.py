@@ -23,6 +23,7 @@ from slrig.calibrate.job import Calibrations, Retention
 from slrig.calibrate.verification import RigHealth
 from slrig.catalogue.store import Copier, catalogue_of, standing
 from slrig.config import ServiceSettings
+from slrig.discovery import DeviceSearch
 from slrig.doctor import EXAMINATIONS, Examinations
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import (
@@ -175,6 +176,7 @@ class Service:
         self.presets = Presets(self.folder.root / "presets", presets or {})
         self.refuse_when_stale = refuse_when_stale
         self.hurry = threading.Event()
+        self.devices = DeviceSearch()
         self._lasting: frozenset[str] = frozenset()
         database, outbox = self.store.database, self.store.outbox
         self.senders = senders_of(settings, outbox)

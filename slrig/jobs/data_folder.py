@@ -58,9 +58,7 @@ class DataFolder:
         self.root = root.resolve()
         self._free = free
         with disk_errors(self.root):
-            for folder in (self.root, self.scans, self.calibrations, self.incoming):
-                folder.mkdir(parents=True, exist_ok=True)
-            self._close_to_others(group)
+            self.root.mkdir(parents=True, exist_ok=True)
             # Whichever thread ends the service lets it go; a kernel that cannot lock is a refusal, not a makeshift.
             self._lock = FileLock(self.root / "lock", mode=0o600, thread_local=False, fallback_to_soft=False)
             try:
@@ -74,6 +72,10 @@ class DataFolder:
             try:
                 # Beside the lock: Windows lets nobody else read what is locked.
                 (self.root / _HOLDER).write_text(f"{os.getpid()}\n", encoding="ascii")
+                # What somebody else uses is not touched.
+                self._close_to_others(group)
+                for folder in (self.scans, self.calibrations, self.incoming):
+                    folder.mkdir(exist_ok=True)
             except BaseException:
                 self._lock.release()
                 raise

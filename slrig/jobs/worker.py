@@ -207,9 +207,12 @@ def serve(
 
 
 def _beat(heartbeat: c_double) -> None:
-    waiting = threading.Event()
+    """Tell that this process lives, until the service does not: a kernel that compiles would go on for minutes."""
+    waiting, service = threading.Event(), os.getppid()
     while not waiting.wait(HEARTBEAT_S):
         heartbeat.value = time.monotonic()
+        if os.getppid() != service:
+            os._exit(1)
 
 
 def _be_ended_first() -> None:

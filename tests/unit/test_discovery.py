@@ -11,6 +11,7 @@ from typing import NoReturn
 import pytest
 from pydantic import BaseModel, ConfigDict
 
+from slrig import discovery
 from slrig.bundle import write_calibration
 from slrig.config import read_rig
 from slrig.devices import (
@@ -23,13 +24,14 @@ from slrig.devices import (
     Rig,
     Trigger,
 )
-from slrig.discovery import discover_devices, installed_drivers, open_rig
+from slrig.discovery import DeviceSearch, DiscoveredDevices, discover_devices, installed_drivers, open_rig
 from slrig.errors import (
     CalibrationError,
     ConfigError,
     DeviceError,
     DeviceGoneError,
     DriverBrokenError,
+    RigBusyError,
 )
 from slrig.model import Calibration, CameraFormat, Size, Truth
 from tests.samples import CAMERA, PROJECTOR, sample_calibration
@@ -342,3 +344,25 @@ def test_a_failing_finder_does_not_hide_the_devices_of_others() -> None:
     findings = discover_devices()
     assert FoundDevice("fake", "usb-1", "a fake camera") in findings.devices
     assert ["finder driver 'lost' failed: OSError: no bus" in str(fault) for fault in findings.faults] == [True]
+
+
+def test_devices_are_searched_once_for_all_who_ask_and_never_beside_a_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s, searches = [100.0], list[float]()
+    nothing = DiscoveredDevices((), (), ())
+
+    def search() -> DiscoveredDevices:
+        searches.append(now_s[0])
+        return nothing
+
+    monkeypatch.setattr(discovery, "discover_devices", search)
+    devices = DeviceSearch(now_s=lambda: now_s[0])
+    with pytest.raises(RigBusyError, match="held by scan 7"):
+        devices.found("scan 7")
+    assert searches == []
+    for _ in range(3):
+        assert devices.found(None) is nothing
+    now_s[0] += 6.0
+    assert devices.found("scan 7") is nothing
+    assert searches == [100.0]
+    devices.found(None)
+    assert searches == [100.0, 106.0]

@@ -22,6 +22,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from slrig.api import files as clouds
+from slrig.api.auth import digest
 from slrig.api.files import _made_so_far, ready_files
 from slrig.api.schemas import ScanRequest
 from slrig.api.service import fingerprint, own_key
@@ -31,7 +32,7 @@ from slrig.devices import Rig
 from slrig.errors import WorkerLostError
 from slrig.jobs import data_folder
 from slrig.jobs.data_folder import DataFolder
-from slrig.jobs.records import JobState
+from slrig.jobs.records import JobState, acting_as
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Task
 from slrig.model import Calibration, CameraFormat, Pinhole, Shot, Size, White
@@ -39,7 +40,7 @@ from slrig.scan.acquisition import Recording, capture_frames
 from slrig.scan.artefacts import ON_REQUEST
 from slrig.scan.plan import PatternPlan, ScanPlan
 from tests.ros_readers import library
-from tests.unit.api.conftest import ServedBench, client_of, ended, refusal
+from tests.unit.api.conftest import KEY, ServedBench, client_of, ended, refusal
 from tests.unit.calibrate.calibration_bench import BOARD
 from tests.unit.capture.fake_rig import CameraFaults, fake_rig
 from tests.unit.jobs.tame_compute import TameCompute
@@ -111,7 +112,9 @@ def test_repeated_request_gets_the_same_scan_and_the_same_answer(client: TestCli
 
 
 def test_key_in_flight_is_refused_for_a_moment(client: TestClient, served: ServedBench) -> None:
-    served.service.keys.reserve(own_key("slow", "/scan"), fingerprint(ScanRequest()))
+    with acting_as("environment", key=digest(KEY)):
+        mine = own_key("slow", "/scan")
+    served.service.keys.reserve(mine, fingerprint(ScanRequest()))
     refused = client.post("/scan", headers={"Idempotency-Key": "slow"})
     assert (refused.status_code, refused.json()["type"]) == (409, "/problems/key-in-flight")
     assert refused.headers["Retry-After"] == "1"

@@ -647,3 +647,13 @@ def test_a_disk_that_refuses_leaves_no_half_backup(
     with pytest.raises(StorageError, match=words):
         back_up(folder.root, tmp_path / "backup")
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="of POSIX modes")
+def test_a_folder_in_use_is_not_touched_by_who_is_refused(tmp_path: Path) -> None:
+    held = DataFolder(tmp_path / "data")
+    (tmp_path / "data").chmod(0o700)
+    with pytest.raises(StorageError, match="in use by"):
+        DataFolder(tmp_path / "data", group="no such group")
+    assert (tmp_path / "data").stat().st_mode & 0o7777 == 0o700
+    held.release()
