@@ -34,7 +34,7 @@ from slrig.api.service import Service
 from slrig.bundle import write_file
 from slrig.calibrate.job import AxisJob, PoseJob, SolveJob
 from slrig.calibrate.verification import VerificationJob
-from slrig.compute.pooled import require_pool_extra
+from slrig.compute.security import require_pool_extra
 from slrig.config import RigConfig, ServiceSettings, is_loopback
 from slrig.conformance import ConformanceJob
 from slrig.discovery import open_rig

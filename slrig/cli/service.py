@@ -45,7 +45,7 @@ def pool(
     """
     if ctx.invoked_subcommand is not None:
         return
-    from slrig.compute.pooled import pool_security, require_pool_extra
+    from slrig.compute.security import pool_security, require_pool_extra
     from slrig.config import read_settings
     from slrig.logs import set_up_logs
 
@@ -71,10 +71,10 @@ def certificates(
 
     Copy each folder to its machine, and nothing else. Called again, it makes those of further names.
     """
-    from slrig.compute.pooled import require_pool_extra
+    from slrig.compute.security import require_pool_extra
 
     require_pool_extra()
-    from slrig.compute.pooled import make_certificates
+    from slrig.compute.certificates import make_certificates
 
     for place in make_certificates(folder, names or ("scheduler", "worker", "rig")):
         typer.echo(place)
@@ -89,7 +89,7 @@ def worker(
     settings: Settings = None,
 ) -> None:
     """Reconstruct for the rigs of a pool, one scan at a time."""
-    from slrig.compute.pooled import pool_security, require_pool_extra
+    from slrig.compute.security import pool_security, require_pool_extra
     from slrig.config import read_settings
     from slrig.errors import ConfigError
     from slrig.logs import set_up_logs

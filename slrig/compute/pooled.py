@@ -10,29 +10,21 @@ import asyncio
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
-from datetime import datetime, timedelta
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Protocol
-from urllib.parse import urlsplit
 from uuid import uuid4
 
 import dask
 import distributed
 import structlog
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from distributed import Client, Security
 
-from slrig.bundle import write_file
 from slrig.compute.host import (
     CONNECT_S,
     POOL_FAULT,
@@ -45,188 +37,18 @@ from slrig.compute.host import (
     open_store,
     resource,
 )
-from slrig.config import ServiceSettings, is_loopback, read_private_text
+from slrig.compute.security import pool_security
+from slrig.config import ServiceSettings
 from slrig.disk import storage_errors
-from slrig.errors import ConfigError, ExtraMissingError, ScanCancelledError, StorageError
+from slrig.errors import ConfigError, ScanCancelledError, StorageError
 from slrig.jobs.data_folder import BUNDLE, RESULT
 from slrig.jobs.database import versions
 from slrig.jobs.job import FrameFeed
-from slrig.jobs.records import utc_now
 from slrig.jobs.worker import POLL_S, Compute, Made, Task, Told, Worker
 from slrig.model import Region
 
 if TYPE_CHECKING:
     from distributed import Security
-
-AUTHORITY, CERTIFICATE, KEY = "authority.pem", "certificate.pem", "key.pem"
-
-
-def require_pool_extra() -> None:
-    """Raise ExtraMissingError unless the libraries of a pool are installed."""
-    if missing := [name for name in ("cryptography", "distributed", "obstore") if find_spec(name) is None]:
-        message = f"A pool needs {' and '.join(missing)}, not installed here: pip install 'slrig[pool]'"
-        raise ExtraMissingError(message)
-
-
-def pool_security(address: str, certificates: Path | None) -> Security | None:
-    """What a member of the pool at `address` shows and asks for; None on this machine alone, without encryption.
-
-    Raises
-    ------
-    ConfigError
-        The address is none, or others could reach it without a certificate; or the certificates cannot be used.
-    """
-    parts = urlsplit(address)
-    try:
-        port = parts.port
-    except ValueError:
-        port = None
-    if parts.scheme not in {"tls", "tcp"} or not parts.hostname or port is None:
-        message = f"'{address}' is no address of a pool's scheduler: expected tls://HOST:PORT, such as tls://pool:8786."
-        raise ConfigError(message)
-    if parts.scheme == "tcp":
-        if not is_loopback(parts.hostname):
-            message = (
-                f"{address}: whoever reaches a pool without encryption can run any code on its machines. Use tls://, "
-                "with certificates that slrig pool certificates makes; tcp:// is for 127.0.0.1 alone."
-            )
-            raise ConfigError(message)
-        return None
-    if certificates is None:
-        message = f"{address}: expected the folder with this machine's certificates, found none; name it."
-        raise ConfigError(message)
-    files = [certificates / name for name in (AUTHORITY, CERTIFICATE, KEY)]
-    if missing := [file.name for file in files if not file.is_file()]:
-        message = (
-            f"{certificates} lacks {', '.join(missing)}. Name the folder of one machine that slrig pool certificates "
-            "made, such as its folder 'worker'."
-        )
-        raise ConfigError(message)
-    read_private_text(certificates / KEY, "the key of this machine's certificate")
-    from distributed import Security
-
-    authority, certificate, key = map(str, files)
-    # One certificate per machine, whatever its part.
-    return Security(
-        require_encryption=True,
-        tls_ca_file=authority,
-        tls_client_cert=certificate,
-        tls_client_key=key,
-        tls_worker_cert=certificate,
-        tls_worker_key=key,
-        tls_scheduler_cert=certificate,
-        tls_scheduler_key=key,
-    )
-
-
-AUTHORITY_KEY = "authority-key.pem"
-"""Whoever has it can join the pool; it stays where it was made."""
-
-AUTHORITY_DAYS, MACHINE_DAYS = 3650, 825
-"""825 days is the longest that systems take a server's certificate for (CA/Browser Forum, ballot 193)."""
-
-LONGEST_NAME = 64
-"""Of a common name in a certificate: RFC 5280, ub-common-name."""
-
-_CLOCKS = timedelta(hours=1)
-"""How far the clock of a machine may be behind."""
-
-
-def make_certificates(folder: Path, names: Sequence[str]) -> list[Path]:
-    """Make an authority in `folder`, unless it is there, and for each name a folder with what `pool_security` reads.
-    Returns those that were made; one that is there stays as it is.
-
-    Raises
-    ------
-    ConfigError
-        A name is no name for a folder, or the authority's files cannot be read.
-    StorageError
-        The disk refused.
-    """
-    for name in names:
-        if not name.replace("-", "").replace("_", "").isalnum() or len(name) > LONGEST_NAME:
-            message = (
-                f"'{name}' is no name for a machine: expected letters, digits, - and _, {LONGEST_NAME} of them at "
-                "most, such as rig-7."
-            )
-            raise ConfigError(message)
-    with storage_errors(folder):
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    key_path, certificate_path = folder / AUTHORITY_KEY, folder / AUTHORITY
-    if not key_path.exists():
-        key = ec.generate_private_key(ec.SECP256R1())
-        authority = _certificate("slrig pool", key.public_key(), None, key)
-        _write_key(key_path, key)
-        write_file(certificate_path, authority.public_bytes(serialization.Encoding.PEM))
-    key, authority = _authority(key_path, certificate_path)
-    made = []
-    for name in names:
-        place = folder / name
-        if (place / CERTIFICATE).exists():
-            continue
-        with storage_errors(place):
-            place.mkdir(mode=0o700, exist_ok=True)
-        own = ec.generate_private_key(ec.SECP256R1())
-        _write_key(place / KEY, own)
-        write_file(place / AUTHORITY, authority.public_bytes(serialization.Encoding.PEM))
-        shown = _certificate(name, own.public_key(), authority, key)
-        write_file(place / CERTIFICATE, shown.public_bytes(serialization.Encoding.PEM))
-        made.append(place)
-    return made
-
-
-def _authority(key_path: Path, certificate_path: Path) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
-    try:
-        text = read_private_text(key_path, f"the authority's key {key_path}")
-        key = serialization.load_pem_private_key(text.encode(), password=None)
-        authority = x509.load_pem_x509_certificate(certificate_path.read_bytes())
-    except (OSError, ValueError, TypeError) as cause:
-        message = f"{certificate_path.parent} holds no authority that can be used. Choose a new folder."
-        raise ConfigError(message) from cause
-    if not isinstance(key, ec.EllipticCurvePrivateKey) or authority.public_key() != key.public_key():
-        message = f"{key_path} is not the key of {certificate_path}. Choose a new folder."
-        raise ConfigError(message)
-    return key, authority
-
-
-def _certificate(
-    name: str, key: ec.EllipticCurvePublicKey, issuer: x509.Certificate | None, signer: ec.EllipticCurvePrivateKey
-) -> x509.Certificate:
-    """A certificate of a key; without an issuer it is an authority's own. RFC 5280."""
-    now, subject = utc_now(), x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-    own = issuer is None
-    last: datetime = now + timedelta(days=AUTHORITY_DAYS if own else MACHINE_DAYS)
-    unused = ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement", "encipher_only")
-    usage = dict.fromkeys((*unused, "decipher_only"), False)
-    builder = (
-        x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(subject if issuer is None else issuer.subject)
-        .public_key(key)
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - _CLOCKS)
-        .not_valid_after(last if issuer is None else min(last, issuer.not_valid_after_utc))
-        .add_extension(x509.BasicConstraints(ca=own, path_length=0 if own else None), critical=True)
-        .add_extension(
-            x509.KeyUsage(digital_signature=not own, key_cert_sign=own, crl_sign=own, **usage), critical=True
-        )
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
-        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False)
-    )
-    if not own:
-        # In a pool each connects, and is connected to.
-        both = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
-        builder = builder.add_extension(x509.ExtendedKeyUsage(both), critical=False)
-    return builder.sign(signer, hashes.SHA256())
-
-
-def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
-    text = key.private_bytes(
-        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    )
-    with storage_errors(path):
-        path.touch(mode=0o600)
-        path.write_bytes(text)
 
 
 CLOSE_S = 1.0
@@ -272,7 +94,7 @@ class Cluster(Protocol):
 
 
 class DaskCluster:
-    """The pool whose scheduler is at `address`. security : see `slrig.compute.pooled.pool_security`."""
+    """The pool whose scheduler is at `address`. security : see `slrig.compute.security.pool_security`."""
 
     def __init__(self, address: str, security: Security | None) -> None:
         self.topic = f"slrig-{uuid4().hex}"

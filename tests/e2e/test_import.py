@@ -267,7 +267,7 @@ class Recorded:
         text = text.replace("[1100.0, 1101.0]", "[880.0, 880.8]").replace("[950.0, 951.0]", "[1900.0, 1902.0]")
         rig.write_text(text)
         sequence = encode(OWN[program], PROJECTOR)
-        monkeypatch.setattr("slrig.scan.acquisition.pattern_sequence", lambda *_, **__: sequence)
+        monkeypatch.setattr("slrig.scan.acquisition.rig_sequence", lambda *_, **__: sequence)
         self.folder = folder / "own"
         with open_rig(read_rig(rig)) as opened:
             plan = ScanPlan()

@@ -9,7 +9,6 @@ import asyncio
 import gc
 import json
 import logging
-import os
 import socket
 import sys
 import threading
@@ -66,7 +65,7 @@ class Server(server._Server):
         await super().startup(sockets)
         asyncio.get_running_loop().call_soon(fail)
         asyncio.get_running_loop().create_task(asyncio.to_thread(fail))
-        logging.getLogger("uvicorn.error").error(SAID.format(key=os.environ[KEY_VARIABLE]))
+        logging.getLogger("uvicorn.error").error(SAID.format(key=KEY))
         await asyncio.to_thread(speak)
 
 

@@ -171,7 +171,8 @@ class Pool:
     def rig(self, local: Compute, *, wired: bool = False) -> tuple[PooledWorker, DaskCluster]:
         """A service's worker, begun, and its connection; `service` is in the environment already."""
         from slrig.compute.host import open_store
-        from slrig.compute.pooled import DaskCluster, PooledWorker, pool_security
+        from slrig.compute.pooled import DaskCluster, PooledWorker
+        from slrig.compute.security import pool_security
 
         address = self.service(wired=wired)["SLRIG_COMPUTE"]
         cluster = DaskCluster(address, pool_security(address, self.certificates))

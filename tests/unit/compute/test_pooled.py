@@ -30,6 +30,7 @@ from distributed import Scheduler, Status
 from distributed.diskutils import DIR_LOCK_EXT
 from obstore.store import MemoryStore
 
+from slrig.compute.certificates import AUTHORITY_KEY, make_certificates
 from slrig.compute.host import (
     BEAT_S,
     CHUNK_BYTES,
@@ -47,17 +48,14 @@ from slrig.compute.host import (
     serve_scheduler,
 )
 from slrig.compute.pooled import (
-    AUTHORITY_KEY,
     BEGIN_LIMIT_S,
-    KEY,
     SILENCE_LIMIT_S,
     TRANSFER_LIMIT_S,
     DaskCluster,
     NewsCallback,
     PooledWorker,
-    make_certificates,
-    pool_security,
 )
+from slrig.compute.security import KEY, pool_security
 from slrig.errors import (
     ConfigError,
     NothingToReconstructError,
