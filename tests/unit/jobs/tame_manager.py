@@ -67,9 +67,16 @@ class TameManager(JobManager):
             self._end(work, self.error)
             self._settle(work)
             return
-        work.stop = _Stop(work, self.cancelled)
+        work.stop = stop = _Stop(work, self.cancelled)
         self._active = work
         self._run(work)
+        if stop.cut:
+            raise PowerCut
+
+    def _clear_up(self, work: _Work, error: Exception | None) -> None:
+        # After a power cut nobody clears up.
+        if not getattr(work.stop, "cut", False):
+            super()._clear_up(work, error)
 
 
 class _Stop(threading.Event):
@@ -79,10 +86,11 @@ class _Stop(threading.Event):
         super().__init__()
         self._work = work
         self._cancelled = cancelled
+        self.cut = False
 
     def is_set(self) -> bool:
         try:
             return self._cancelled()
         except PowerCut:
-            self._work.ended = self._work.settled = True
+            self.cut = self._work.ended = self._work.settled = True
             raise
