@@ -205,6 +205,10 @@ class ArtefactNotReadyError(SlrigError, code="artefact-not-ready"):
     """The scan exists, but the requested file does not exist yet or never will (the scan failed)."""
 
 
+class DamagedError(SlrigError, code="damaged"):
+    """A file of a finished job is not as it was written: cut, changed or gone. It is not given out."""
+
+
 class ScanStateError(SlrigError, code="scan-state"):
     """The scan exists, but its state forbids the call: deleting one that runs, for example."""
 

@@ -102,3 +102,12 @@ def disk_errors(path: Path) -> Iterator[None]:
         if error.errno not in _DISK_REFUSALS:
             raise
         raise StorageError(disk_error_message(error, path)) from error
+
+
+def as_error(raised: BaseException) -> Exception:
+    """What ended a job, as an error: the service's threads do not end by what a job raises, SystemExit among it."""
+    if isinstance(raised, Exception):
+        return raised
+    error = RuntimeError(f"{type(raised).__name__} ended it")
+    error.__cause__ = raised
+    return error

@@ -16,6 +16,7 @@ import numpy as np
 from slrig.accept.evaluation import AcceptanceResult, Reading, reading, verdicts
 from slrig.accept.plan import AcceptancePlan, Artefact, Step, takes_of, turn_deg
 from slrig.accept.store import (
+    POSITIONS,
     READINGS,
     AcceptanceRecord,
     AcceptanceState,
@@ -41,7 +42,7 @@ from slrig.errors import (
     UnsupportedByDeviceError,
     setting,
 )
-from slrig.jobs.data_folder import BUNDLE, DataFolder
+from slrig.jobs.data_folder import BUNDLE, DataFolder, write_entries
 from slrig.jobs.job import Job, JobRun, Outcome
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import Clock, Holder, JobKind, JobRecord, utc_now
@@ -439,7 +440,9 @@ class AcceptanceTests:
             if following is not None and job.scripted and record.state.waiting and not begun:
                 next_job = self._position(record, following[0].name, scripted=True)
                 self._manager.add(next_job, holder=self._holders.get(job.group))
-        self._manager.data.remove(self._store.folder(job.group) / "positions" / job.step / BUNDLE)
+        place = self._store.folder(job.group) / POSITIONS / job.step
+        self._manager.data.remove(place / BUNDLE)
+        write_entries(place)
         if following is None and record.state.waiting:
             self._holders.pop(job.group, None)
             self._conclude(record)

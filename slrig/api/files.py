@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 from uuid import UUID
 
+import structlog
 from fastapi import APIRouter, Header, Response
 from fastapi import Path as PathParameter
 from fastapi.responses import FileResponse, StreamingResponse
@@ -19,8 +20,16 @@ from fastapi.responses import FileResponse, StreamingResponse
 from slrig.api.problems import BYTES, file_of
 from slrig.api.service import Service, Serving
 from slrig.bundle import CALIBRATION, CAMERA_NAME, DESCRIPTION, write_file
-from slrig.errors import ArtefactNotReadyError, InvalidInputError, JobNotFoundError, StorageError, WorkerBusyError
-from slrig.jobs.data_folder import BUNDLE, DataFolder
+from slrig.errors import (
+    ArtefactNotReadyError,
+    DamagedError,
+    InvalidInputError,
+    JobNotFoundError,
+    StorageError,
+    WorkerBusyError,
+)
+from slrig.failure import job_failure
+from slrig.jobs.data_folder import BUNDLE, FILES, DataFolder, read_entries
 from slrig.jobs.records import JobKind, JobRecord, JobState
 from slrig.jobs.worker import Task
 from slrig.scan.artefacts import MESH, ON_REQUEST, REPORT, converted, write_converted
@@ -123,6 +132,8 @@ _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 
 router = APIRouter(prefix="/scan/{scan_id}", tags=["files"])
 
+_log = structlog.get_logger(__name__)
+
 Camera = Annotated[str, PathParameter(pattern=CAMERA_NAME)]
 KnownTag = Annotated[str | None, Header(alias="If-None-Match", description="an ETag; 304 if it still holds")]
 
@@ -179,11 +190,14 @@ def _file(service: Service, scan_id: UUID, name: str, media_type: str, known: st
         record = service.store.get(scan_id, JobKind.SCAN)
         service.scan_retention.reading(scan_id)
         if is_made and record.state.final and service.folder.owns(place / MESH) and not os.path.lexists(path):
+            require_whole(service, record, place, MESH)
             write_converted(place, name)
         made = _made_so_far(service.folder, record, name)
+    if made is None and record.state.final:
+        require_whole(service, record, place, MESH if name in ON_REQUEST else name)
     if made is None and not (record.state.final and service.folder.owns(path)):
         refuse_absent(record, path.name)
-    headers = _headers(scan_id, name)
+    headers = _headers(scan_id, name, None if made is not None else place)
     if _still_known(known, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     if made is not None:
@@ -192,9 +206,20 @@ def _file(service: Service, scan_id: UUID, name: str, media_type: str, known: st
     return _kept(path, media_type, headers)
 
 
+def require_whole(service: Service, record: JobRecord, place: Path, *names: str) -> None:
+    """Raise DamagedError unless files of a job that is over are as they were committed. The record says so, too."""
+    try:
+        service.folder.require_whole(place, *names)
+    except DamagedError as error:
+        _log.error("files are damaged", kind=str(record.kind), job=str(record.id), cause=str(error))
+        if record.state is JobState.SUCCEEDED:
+            service.store.lose_files(record.id, job_failure(error))
+        raise
+
+
 def kept_file(path: Path, media_type: str, job_id: UUID, known: str | None) -> Response:
     """A file that never changes, of a job that is over; 304 where the client knows it."""
-    headers = _headers(job_id, path.name)
+    headers = _headers(job_id, path.name, path.parent)
     return (
         Response(status_code=304, headers=headers)
         if _still_known(known, headers["ETag"])
@@ -216,10 +241,11 @@ def _cloud(service: Service, scan_id: UUID, form: str, camera: str | None, known
     service.scan_retention.reading(scan_id)
     if not record.state.final or not has_sources(service.folder, place, camera):
         refuse_absent(record, path.name)
-    headers = _headers(scan_id, path.name)
+    headers = _headers(scan_id, path.name, place)
     if _still_known(known, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     if not os.path.lexists(path):
+        require_whole(service, record, place, *read_entries(place))
         make_cloud(service, scan_id, form, camera)
     if not service.folder.owns(path):
         refuse_absent(record, path.name)
@@ -238,9 +264,14 @@ def _made_so_far(folder: DataFolder, record: JobRecord, name: str) -> bytes | No
     return None
 
 
-def _headers(job_id: UUID, name: str) -> dict[str, str]:
-    # A job's files never change once they are there, and an id is never given twice.
-    return {"ETag": f'"{job_id}/{name}"', "Cache-Control": "private, no-cache"}
+def _headers(job_id: UUID, name: str, place: Path | None) -> dict[str, str]:
+    # An id is never given twice, and a job's files change only where they are made once more.
+    committed = None
+    if place is not None:
+        with suppress(OSError):
+            committed = (place / FILES).stat().st_mtime_ns
+    tag = f"{job_id}/{name}" if committed is None else f"{job_id}/{name}/{committed:x}"
+    return {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache"}
 
 
 def _still_known(known: str | None, tag: str) -> bool:
@@ -369,7 +400,12 @@ def fetch_bundle(service: Serving, scan_id: UUID, known: KnownTag = None) -> Res
     bundle = service.folder.scan(scan_id) / BUNDLE
     if not record.state.final or not service.folder.owns(bundle):
         refuse_absent(record, BUNDLE_ZIP)
-    headers = {**_headers(scan_id, BUNDLE_ZIP), "Content-Disposition": f'attachment; filename="{scan_id}.zip"'}
+    recorded = [each for each in read_entries(bundle.parent) if each.startswith(f"{BUNDLE}/")]
+    require_whole(service, record, bundle.parent, *recorded)
+    headers = {
+        **_headers(scan_id, BUNDLE_ZIP, bundle.parent),
+        "Content-Disposition": f'attachment; filename="{scan_id}.zip"',
+    }
     if _still_known(known, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     return StreamingResponse(zipped(bundle), media_type="application/zip", headers=headers)

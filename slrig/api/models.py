@@ -9,7 +9,7 @@ from uuid import UUID
 from fastapi import APIRouter, Body, Response
 from pydantic import BaseModel, Field, model_validator
 
-from slrig.api.files import KnownTag, file_answers, kept_file, refuse_absent
+from slrig.api.files import KnownTag, file_answers, kept_file, refuse_absent, require_whole
 from slrig.api.problems import problems
 from slrig.api.schemas import JobBody, JobLinks, ShotRequest, filled, scan_plan
 from slrig.api.service import Cursor, IdempotencyKey, PageLength, Service, Serving, once, paged, started_once
@@ -171,6 +171,7 @@ def _serve(name: str, media_type: str) -> Callable[..., Response]:
         record, path = service.store.get(model_id, JobKind.MODEL), service.models.place(model_id) / name
         if record.state is not JobState.SUCCEEDED or not service.folder.owns(path):
             refuse_absent(record, name)
+        require_whole(service, record, path.parent, name)
         return kept_file(path, media_type, model_id, known)
 
     fetch.__doc__ = f"Return {name} of a model that succeeded. ETags and ranges are honoured."

@@ -93,6 +93,16 @@ def cancel_series(service: Serving, series_id: UUID) -> ScanSeries:
     return ScanSeries(scans=[_body(service, record) for record in _cancel_series(service.manager, series_id)])
 
 
+@router.post("/{scan_id}/reconstruct", status_code=202, responses=problems(409, 410, 503, 507))
+def reconstruct_scan(service: Serving, scan_id: UUID) -> ScanBody:
+    """Make mesh and files of a finished scan anew from its bundle, as after a failure, damage or an update. Its files
+    stay until then. Follow `links.events` for the rest.
+    """
+    service.store.get(scan_id, JobKind.SCAN)
+    with service.models.unused(scan_id):
+        return _body(service, service.manager.compute_again(scan_id))
+
+
 @router.put("/{scan_id}/pin")
 def pin_scan(service: Serving, scan_id: UUID) -> ScanBody:
     """Keep a scan, whatever the settings say of old ones. DELETE lets it go the way of the others again."""

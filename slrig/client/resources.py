@@ -76,6 +76,10 @@ class Scans(Resource):
         """Stop a scan between two frames."""
         return self._connection.json("POST", path("/scan/{}/cancel", scan_id))
 
+    def reconstruct(self, scan_id: str) -> Json:
+        """Make mesh and files of a finished scan anew from its bundle; `Client.job` follows it."""
+        return self._connection.json("POST", path("/scan/{}/reconstruct", scan_id))
+
     def pin(self, scan_id: str) -> Json:
         """Keep a scan, even where the settings delete old ones."""
         return self._connection.json("PUT", path("/scan/{}/pin", scan_id))

@@ -25,7 +25,7 @@ from pydantic import TypeAdapter, ValidationError
 from slrig.bundle import sync_folder, sync_tree
 from slrig.disk import staging_name, storage_errors
 from slrig.errors import StorageError
-from slrig.jobs.data_folder import DATABASE, ORPHANS, SCANS
+from slrig.jobs.data_folder import DATABASE, ORPHANS, SCANS, FileEntry, file_entry, read_entries
 from slrig.jobs.database import PATIENCE_S
 from slrig.jobs.records import JobKind, JobState, utc_now
 
@@ -36,14 +36,6 @@ OF_ONE_RUN = frozenset({"lock", "holder", "service.json", "cache", "keys.lock", 
 
 _CHUNK_BYTES = 2**20
 _MOST_TRIES = 5
-
-
-@dataclass(frozen=True, slots=True)
-class FileEntry:
-    """A file of a backup: its SHA-256 and its length."""
-
-    sha256: str
-    size_bytes: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,10 +92,7 @@ def back_up(root: Path, to: Path, *, previous: Path | None = None) -> Manifest:
             copy = _BackupCopy(root, data, earlier)
             copy.everything(scans)
             _forget(data / DATABASE, copy.gone)
-            with (data / DATABASE).open("rb") as file:
-                copy.files[DATABASE] = FileEntry(
-                    hashlib.file_digest(file, "sha256").hexdigest(), os.fstat(file.fileno()).st_size
-                )
+            copy.files[DATABASE] = file_entry(data / DATABASE)
             count = sum(name.startswith(f"{SCANS}/") and name.count("/") == 1 for name in copy.folders)
             manifest = Manifest(
                 "slrig-backup", 1, utc_now(), count, copy.files, tuple(copy.folders), tuple(copy.left_out)
@@ -252,10 +241,22 @@ class _BackupCopy:
         self._make(name)
         try:
             self._contents(f"{name}/")
+            self._leave_damaged(name)
         except _GoneError:
             self._drop(name)
             self.gone.append(name)
             self.left_out.append(f"{name}: was removed meanwhile")
+
+    def _leave_damaged(self, name: str) -> None:
+        """Leave out files of a finished job that are not as they were committed."""
+        entries = read_entries(self._to / name)
+        for file, entry in entries.items():
+            copied = self.files.get(f"{name}/{file}")
+            if copied != entry:
+                self.left_out.append(f"{name}/{file}: is damaged")
+                if copied is not None:
+                    del self.files[f"{name}/{file}"]
+                    (self._to / name / file).unlink()
 
     def _make(self, name: str) -> None:
         (self._to / name).mkdir(mode=0o700)

@@ -3,7 +3,7 @@
 DATA/lock            locked by the one process that owns the folder, as long as it lives; empty
 DATA/holder          that process's id, and that of the last one where none lives
 DATA/slrig.sqlite    the records
-DATA/scans/ID/       a finished scan: bundle/, mesh.ply, report.json ...
+DATA/scans/ID/       a finished scan: bundle/, mesh.ply, report.json ..., and files.json with the digests of all
 DATA/calibrations/   calibrations and their sessions: see `slrig.calibrate.store`
 DATA/acceptance/     acceptance tests: see `slrig.accept.store`
 DATA/models/         models of several scans: see `slrig.model_jobs.job`
@@ -16,17 +16,21 @@ DATA/cache/          compiled kernels, where the package's own folder cannot be 
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from uuid import UUID, uuid4
 
 import structlog
 from filelock import FileLock, Timeout
+from pydantic import TypeAdapter, ValidationError
 
-from slrig.bundle import sync_folder, sync_tree
-from slrig.errors import DataFolderGoneError, StorageError
+from slrig.bundle import sync_folder, sync_tree, write_file
+from slrig.errors import DamagedError, DataFolderGoneError, StorageError
 from slrig.failure import disk_errors
 
 DATABASE, SCANS, ORPHANS, BUNDLE = "slrig.sqlite", "scans", ".orphans", "bundle"
@@ -34,9 +38,80 @@ DATABASE, SCANS, ORPHANS, BUNDLE = "slrig.sqlite", "scans", ".orphans", "bundle"
 RESULT = "result"
 """Below the folder of a job: files that can be fetched before it is over."""
 
+FILES = "files.json"
+"""In the folder of a finished job: size and digest of each of its files, as they were committed."""
+
 _HOLDER = "holder"
 
 _log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class FileEntry:
+    """A file: its SHA-256 and its length."""
+
+    sha256: str
+    size_bytes: int
+
+
+_entries_adapter = TypeAdapter(dict[str, FileEntry])
+
+
+def write_entries(folder: Path) -> None:
+    """Write `FILES`: the digests of all files of a folder. Raises StorageError."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and not path.is_symlink() and path != folder / FILES:
+            found[path.relative_to(folder).as_posix()] = file_entry(path)
+    write_file(folder / FILES, _entries_adapter.dump_json(found))
+
+
+def file_entry(path: Path) -> FileEntry:
+    """Digest and length of a file. Raises OSError."""
+    with path.open("rb") as file:
+        return FileEntry(hashlib.file_digest(file, "sha256").hexdigest(), os.fstat(file.fileno()).st_size)
+
+
+def read_entries(folder: Path) -> Mapping[str, FileEntry]:
+    """What `FILES` says of a folder: none where there is no such file; where it cannot be read, an impossible entry of
+    itself, so that no damage keeps a service from its start.
+    """
+    try:
+        return _entries_adapter.validate_json((folder / FILES).read_bytes())
+    except FileNotFoundError:
+        return {}
+    except (ValidationError, OSError):
+        return {FILES: FileEntry("", -1)}
+
+
+def damaged_files(folder: Path, *, digests: bool, names: Iterable[str] | None = None) -> dict[str, str]:
+    """What is wrong with files of a finished job, by their names: gone, of another length, changed. Files that `FILES`
+    does not name were made later, and are not looked at; nothing is where there is no `FILES`.
+
+    digests : compare contents, too, which reads the files. names : those to look at; None for all.
+    """
+    entries = read_entries(folder)
+    if FILES in entries:
+        return {FILES: "cannot be read"}
+    found = {}
+    for name in entries if names is None else entries.keys() & set(names):
+        path, entry = folder / name, entries[name]
+        try:
+            size_bytes = path.lstat().st_size if not path.is_symlink() else -1
+            if size_bytes != entry.size_bytes:
+                found[name] = f"has {size_bytes} bytes of {entry.size_bytes}" if size_bytes >= 0 else "is a link"
+            elif digests and file_entry(path) != entry:
+                found[name] = "was changed"
+        except OSError as error:
+            found[name] = "is gone" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
+    return found
+
+
+def damage(what: str, found: Mapping[str, str], remedy: str) -> DamagedError:
+    """The error of files that are not as they were written. what : whose they are."""
+    named = [f"{name} {cause}" for name, cause in sorted(found.items())]
+    more = f" and {len(named) - 3} more" if len(named) > 3 else ""
+    return DamagedError(f"{what}: {'; '.join(named[:3])}{more}. Look after the disk. {remedy}")
 
 
 def free_bytes(folder: Path) -> int:
@@ -57,6 +132,7 @@ class DataFolder:
     def __init__(self, root: Path, *, free: Callable[[Path], int] = free_bytes, group: str | None = None) -> None:
         self.root = root.resolve()
         self._free = free
+        self._whole: dict[Path, tuple[int, int, int]] = {}
         with disk_errors(self.root):
             self.root.mkdir(parents=True, exist_ok=True)
             # Whichever thread ends the service lets it go; a kernel that cannot lock is a refusal, not a makeshift.
@@ -217,6 +293,13 @@ class DataFolder:
             folder.mkdir()
         return folder
 
+    def stage_bundle(self, job_id: UUID, place: Path) -> None:
+        """Stage a job that is over once more, with its bundle: links to the same files, which nobody changes."""
+        staged = self.stage(job_id)
+        with disk_errors(staged):
+            shutil.copytree(place / BUNDLE, staged / BUNDLE, copy_function=os.link)
+            sync_tree(staged)
+
     def put(self, job_id: UUID, place: Path) -> None:
         """Move what is staged for a job to its place, by one rename, durable: all but a bundle, which is so already.
 
@@ -230,11 +313,27 @@ class DataFolder:
                 for file in sorted(result.iterdir()):
                     file.rename(staged / file.name)
                 result.rmdir()
+            write_entries(staged)
             sync_tree(staged, except_folder=BUNDLE)
             self.remove(place)
             staged.rename(place)
             sync_folder(place.parent)
             sync_folder(self.incoming)
+
+    def require_whole(self, place: Path, *names: str) -> None:
+        """Raise DamagedError unless files of a finished job are as they were committed. Each is read once, until it
+        changes.
+        """
+        looked = {}
+        for name in names:
+            with suppress(OSError):
+                found = (place / name).stat()
+                looked[place / name] = (found.st_ino, found.st_size, found.st_mtime_ns)
+        unknown = [each for each in names if self._whole.get(place / each) != looked.get(place / each, ())]
+        found_damage = damaged_files(place, digests=True, names=unknown) if unknown else {}
+        if found_damage:
+            raise damage(f"Files of {place.name} are damaged", found_damage, "They are not given out.")
+        self._whole.update(looked)
 
     def remove(self, place: Path) -> None:
         """Remove files by one rename out of their place first. Idempotent. Raises StorageError."""
@@ -258,7 +357,8 @@ class DataFolder:
         """
         if self.recording(job_id).is_dir():
             self.keep_recording(job_id)
-        if not (self.staging(job_id) / BUNDLE).is_dir():
+        if not (self.staging(job_id) / BUNDLE).is_dir() or self.owns(place / BUNDLE):
+            # Nothing was recorded; or it was computed once more, and is there.
             return
         self.clear_results(job_id)
         self.put(job_id, place)

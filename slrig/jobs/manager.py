@@ -19,6 +19,7 @@ from uuid import UUID, uuid4
 import structlog
 
 from slrig.errors import (
+    ArtefactNotReadyError,
     CameraNotFoundError,
     DeviceBusyError,
     DeviceError,
@@ -32,10 +33,20 @@ from slrig.errors import (
     SlrigError,
     StorageError,
 )
-from slrig.failure import UNEXPECTED, JobFailure, interruption_error, job_failure
-from slrig.jobs.data_folder import DataFolder, missing_files
+from slrig.failure import UNEXPECTED, JobFailure, as_error, interruption_error, job_failure
+from slrig.jobs.data_folder import BUNDLE, DataFolder, missing_files, read_entries
 from slrig.jobs.job import FrameFeed, Group, Job, JobRun, Outcome, ProgressRecorder, Recording, due_s
-from slrig.jobs.records import Holder, JobKind, JobRecord, JobState, acting_as, holder_of, utc_now, write_record
+from slrig.jobs.records import (
+    Holder,
+    JobKind,
+    JobRecord,
+    JobState,
+    acting_as,
+    holder_of,
+    read_record,
+    utc_now,
+    write_record,
+)
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Compute, job_task
 from slrig.rig.preview import Light, Previews, Watch
@@ -272,6 +283,32 @@ class JobManager:
         """Have a job done that is on record, however many wait. captured : its frames are there."""
         with self._changed:
             self._line_up([self._work(job, record, holder, captured=captured)])
+
+    def compute_again(self, job_id: UUID) -> JobRecord:
+        """Have a finished job computed once more from its bundle; what comes of it takes the place of its files then.
+
+        Raises JobNotFoundError; ScanStateError where it is not over, or of a kind that is not computed from its bundle
+        alone; ArtefactNotReadyError without a bundle; DamagedError where that is damaged; StorageError.
+        """
+        record = self.store.get(job_id)
+        job = self.kinds[record.kind].from_record(record)
+        place = job.place(self.data, job_id)
+        if not record.state.final or not job.movable or place is None:
+            message = f"{record.kind.capitalize()} {job_id} is {record.state}, and cannot be computed again."
+            raise ScanStateError(message)
+        if not self.data.owns(place / BUNDLE):
+            message = f"{record.kind.capitalize()} {job_id} has no bundle: its frames are gone. Start another one."
+            raise ArtefactNotReadyError(message)
+        bundle = [name for name in read_entries(place) if name.startswith(f"{BUNDLE}/")]
+        self.data.require_whole(place, *bundle)
+        self.require_space(sum(path.stat().st_size for path in place.iterdir() if path.is_file()))
+        self.data.stage_bundle(job_id, place)
+        with self._changed:
+            if self._ending:
+                raise interruption_error()
+            self.store.advance(job_id, JobState.COMPUTING)
+        self.begin(job, record, captured=True)
+        return self.store.get(job_id)
 
     def cancel(self, job_id: UUID) -> JobRecord:
         """Ask a job to end early, and return it at once; one that is over stays so. Raises JobNotFoundError."""
@@ -532,7 +569,7 @@ class JobManager:
                     self._capture(work)
                 error = None
             except BaseException as raised:  # noqa: BLE001 - the owner thread goes on after any failure of one job
-                error = interruption_error() if self._ending else _as_error(raised)
+                error = interruption_error() if self._ending else as_error(raised)
             finally:
                 self.rig.darken()
             goes_on = error is None and self._frees_rig(work)
@@ -603,7 +640,7 @@ class JobManager:
             with driver_errors(self.rig.name):
                 self._previews.run(rig, stop=self._wanted)
         except BaseException as raised:  # noqa: BLE001 - the owner thread goes on after any failure of a preview
-            error = _as_error(raised)
+            error = as_error(raised)
             self.rig.let_go(error)
             self._log_unopened(error)
             fault = job_failure(error)
@@ -631,7 +668,7 @@ class JobManager:
                     work.outcome = self._computed(work)
                 error = None
             except BaseException as raised:  # noqa: BLE001 - it is the end of the job
-                error = interruption_error() if self._ending else _as_error(raised)
+                error = interruption_error() if self._ending else as_error(raised)
             self._clear_up(work, error)
         except Exception:  # noqa: BLE001 - as on the owner thread
             _log.exception("the end of work that computes went wrong", work=work.holder.words)
@@ -777,6 +814,9 @@ class JobManager:
             fault = work.outcome.fault
             state = JobState.SUCCEEDED if fault is None else JobState.FAILED
             self._ends.append(_End(work.id, state, work.outcome))
+        elif isinstance(error, ScanCancelledError) and (kept := self._committed(work)) is not None:
+            # It was computed once more, and its files are as before.
+            self._ends.append(_End(work.id, kept.state, Outcome(kept.summary, kept.fault)))
         elif _goes_on(work, error):
             _log.info("a job is left to the next start of the service", job=str(work.id))
         else:
@@ -786,6 +826,12 @@ class JobManager:
                 end = replace(end, state=JobState.CANCELLED)
             end = replace(end, outcome=replace(end.outcome, summary=work.outcome.summary))
             self._ends.append(end)
+
+    def _committed(self, work: _Work) -> JobRecord | None:
+        """The record that lies with the files of a job that was over before; None where there is none."""
+        place = work.job.place(self.data, work.id)
+        kept = None if place is None else read_record(place)
+        return kept if kept is not None and kept.id == work.id else None
 
     def _settle(self, work: _Work) -> None:
         """Record how a job ended, if that is known. The rig is free; on any thread."""
@@ -894,15 +940,6 @@ class JobManager:
         with self._changed:
             self._changed.wait_for(lambda: not self._computing, max(give_up - time.monotonic(), 0.0))
         self._cut_off(interruption_error(), self._under_way)
-
-
-def _as_error(raised: BaseException) -> Exception:
-    """What ended a job, as an error: the service's threads do not end by what a job raises, SystemExit among it."""
-    if isinstance(raised, Exception):
-        return raised
-    error = RuntimeError(f"{type(raised).__name__} ended it")
-    error.__cause__ = raised
-    return error
 
 
 def _goes_on(work: _Work, error: Exception) -> bool:

@@ -9,7 +9,7 @@ import structlog
 
 from slrig.errors import StorageError
 from slrig.failure import interruption_error, job_failure
-from slrig.jobs.data_folder import BUNDLE, missing_files, remove
+from slrig.jobs.data_folder import BUNDLE, damage, damaged_files, missing_files, remove
 from slrig.jobs.job import Job, Outcome
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import JobRecord, JobState, acting_as, read_record
@@ -96,6 +96,10 @@ def _require_files(manager: JobManager, record: JobRecord) -> None:
         return
     missing = missing_files(place, job.promises)
     if not missing:
+        found = damaged_files(place, digests=False)
+        if found:
+            store.lose_files(record.id, job_failure(damage(f"Files of this {job.noun} are damaged", found, job.remedy)))
+            _note(record, "damaged")
         return
     if data.owns(data.staging(record.id)):
         store.delete(record.id)
@@ -123,6 +127,8 @@ def _restore(manager: JobManager, kind: type[Job]) -> None:
         with acting_as(kept.requested_by):
             store.restore(kept)
         _note(kept, "recovered")
+        if kept.state is JobState.SUCCEEDED:
+            _require_files(manager, kept)
 
 
 def _belongs(manager: JobManager, kept: JobRecord, place: Path) -> bool:

@@ -383,6 +383,9 @@ class JobStore:
         """Record that a running job entered another running state, and return when."""
         with self.database.changing() as session:
             row = self._find(session, job_id)
+            if JobState(row.state).final:
+                # It is computed once more.
+                row.finished_at = row.summary = row.failure_code = row.failure_message = None
             row.state = state
             now = self._now()
             row.started_at = row.started_at or now
@@ -545,8 +548,7 @@ class JobStore:
         row.summary = None if summary is None else dict(summary)
         if state is JobState.SUCCEEDED:
             row.stage, row.fraction, row.detail = "done", 1.0, ""
-        if fault is not None:
-            row.failure_code, row.failure_message = fault.code, fault.message
+        row.failure_code, row.failure_message = (None, None) if fault is None else (fault.code, fault.message)
         error = None if fault is None else {"code": fault.code, "message": fault.message}
         _append(session, row, "state", {"state": state, "time": row.finished_at, "error": error})
         self.outbox.closed(session, record_of(row))

@@ -311,7 +311,7 @@ class Models:
                 if str(scan_id) in record.plan["scans"] or self.jobs.get(scan_id).parent == record.id:
                     message = (
                         f"Scan {scan_id} is needed by model {record.id}, which is {record.state}. Wait for it, or "
-                        f"cancel it first (POST /model/{record.id}/cancel), then delete the scan."
+                        f"cancel it first (POST /model/{record.id}/cancel)."
                     )
                     raise ScanStateError(message)
             yield

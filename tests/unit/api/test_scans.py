@@ -31,7 +31,7 @@ from slrig.bundle.writing import BundleWriter
 from slrig.devices import Rig
 from slrig.errors import WorkerLostError
 from slrig.jobs import data_folder
-from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.data_folder import DataFolder, write_entries
 from slrig.jobs.records import JobState, acting_as
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Task
@@ -219,6 +219,7 @@ def test_old_scans_and_calibrations_are_removed_but_for_pinned_ones(
 SIZE = Size(40, 30)
 NAME = "points-left.npz"
 NOT_READY = (409, "/problems/artefact-not-ready")
+DAMAGED = (410, "/problems/damaged")
 
 
 def finished(client: TestClient) -> dict[str, Any]:
@@ -252,6 +253,46 @@ def test_file_is_sent_whole_in_part_or_not_again(client: TestClient, name: str) 
         assert beyond.headers["content-range"] == f"bytes */{len(whole.content)}"
 
 
+@pytest.mark.parametrize("name", ["mesh.ply", "report.json", "preview.png"])
+def test_a_damaged_file_is_not_sent_and_made_again_from_the_bundle(
+    client: TestClient, served: ServedBench, name: str
+) -> None:
+    scan = finished(client)
+    path, files = place_of(served, scan["id"]) / name, scan["links"]["files"]
+    sound = client.get(files[name])
+    changed = bytearray(path.read_bytes())
+    changed[len(changed) // 2] ^= 4
+    path.write_bytes(changed)
+    damaged = client.get(files[name])
+    assert (damaged.status_code, damaged.json()["type"]) == DAMAGED
+    assert f"{name} was changed" in damaged.json()["detail"]
+    shown = client.get(scan["links"]["self"]).json()
+    assert (shown["state"], shown["error"]["type"]) == ("failed", "/problems/damaged")
+    assert client.get(files["bundle.zip"]).status_code == 200
+    again = client.post(f"/scan/{scan['id']}/reconstruct")
+    assert again.status_code == 202, again.text
+    remade = ended(client, scan["id"])
+    assert (remade["state"], remade.get("error")) == ("succeeded", None)
+    fetched = client.get(files[name], headers={"If-None-Match": sound.headers["ETag"]})
+    assert fetched.status_code == 200, "the client's copy is of the earlier files"
+    assert fetched.content == path.read_bytes()
+
+
+def test_what_cannot_be_reconstructed_again_says_why(client: TestClient, served: ServedBench) -> None:
+    served.gate.clear()
+    runs = client.post("/scan").json()["id"]
+    assert refusal(client, "POST", f"/scan/{runs}/reconstruct") == (409, "/problems/scan-state")
+    served.gate.set()
+    ended(client, runs)
+    frame = next((place_of(served, runs) / "bundle" / "frames").rglob("*.*"))
+    frame.write_bytes(frame.read_bytes()[:-1])
+    before = sorted(place_of(served, runs).iterdir())
+    assert refusal(client, "POST", f"/scan/{runs}/reconstruct") == DAMAGED
+    assert refusal(client, "GET", f"/scan/{runs}/bundle.zip") == DAMAGED
+    assert sorted(place_of(served, runs).iterdir()) == before
+    assert refusal(client, "POST", f"/scan/{uuid4()}/reconstruct")[0] == 404
+
+
 def test_bundle_is_a_zip_of_stored_files_without_links(client: TestClient, served: ServedBench, tmp_path: Path) -> None:
     scan = finished(client)
     place = place_of(served, scan["id"])
@@ -269,14 +310,14 @@ def test_bundle_is_a_zip_of_stored_files_without_links(client: TestClient, serve
         assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_STORED}
         (frame,) = [name for name in names if name.startswith("frames/")][:1]
         assert archive.read(frame) == (place / "bundle" / frame).read_bytes()
-    # Links in place of files that are sent alone are not followed, either.
+    # Links in place of files that are sent alone are not followed, either: they are damage.
     for name in ("report.json", "preview.png", "mesh.obj", "mesh.ply"):
         (place / name).unlink(missing_ok=True)
         (place / name).symlink_to(tmp_path / "secret")
     files = client.get(scan["links"]["self"]).json()["links"]["files"]
     assert sorted(files) == ["bundle.zip", "mesh.glb", "points.ply"]
     for name in ("report.json", "preview.png", "mesh.obj", "mesh.stl", "view.glb", "mesh.ply"):
-        assert refusal(client, "GET", f"/scan/{scan['id']}/{name}") == NOT_READY, name
+        assert refusal(client, "GET", f"/scan/{scan['id']}/{name}") == DAMAGED, name
     assert client.delete(scan["links"]["self"]).status_code == 204
     assert (tmp_path / "secret").read_text() == "of another folder"
 
@@ -292,7 +333,7 @@ def test_other_format_of_the_mesh_is_made_once(client: TestClient, served: Serve
     assert ((place / name).stat().st_ino, (place / name).stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
     (place / "mesh.ply").write_bytes((place / "mesh.ply").read_bytes()[:-1])
     damaged = client.get(f"/scan/{scan_id}/mesh.obj")
-    assert (damaged.status_code, "reconstruct the bundle again" in damaged.json()["detail"]) == (422, True)
+    assert (damaged.status_code, "mesh.ply has" in damaged.json()["detail"]) == (410, True)
 
 
 def test_pictures_go_by_camera(client: TestClient, served: ServedBench) -> None:
@@ -437,6 +478,7 @@ def scan(client: TestClient, served: ServedBench) -> str:
     refused = np.zeros(SIZE.shape, dtype=np.uint8)
     refused[:12] = 1
     (place / "causes-left.png").write_bytes(cv2.imencode(".png", refused)[1].tobytes())
+    write_entries(place)
     return scan_id
 
 
@@ -504,6 +546,10 @@ def test_source_of_a_cloud_that_was_changed_is_named(
 ) -> None:
     place = place_of(served, scan)
     (place / name).write_bytes(content)
+    damaged = client.get(f"/scan/{scan}/{NAME}")
+    assert (damaged.status_code, name in damaged.json()["detail"]) == (410, True)
+    # One that was committed so is looked at by what makes the cloud.
+    write_entries(place)
     refused = client.get(f"/scan/{scan}/{NAME}")
     assert refused.status_code == 422
     assert Path(name).name in refused.json()["detail"]
@@ -540,6 +586,7 @@ def test_scan_is_one_bag_of_all_its_cameras(client: TestClient, served: ServedBe
     with BundleWriter(tmp_path / "bundle", SIZE, [White()], forms, captured_at=moment) as written:
         written.add(Shot(0, "left", np.zeros(SIZE.shape, dtype=np.uint8)))
     shutil.copytree(tmp_path / "bundle", bundle, dirs_exist_ok=True)
+    write_entries(bundle.parent)
     files = client.get(f"/scan/{scan}").json()["links"]["files"]
     assert client.get(files["calibration.json"]).json()["cameras"]["left"]["size_px"] == [40, 30]
     fetched = client.get(files["scan.mcap"])

@@ -63,7 +63,7 @@ def test_session_walks_from_poses_to_the_calibration_in_use(bench: CalibrationBe
     assert (dict(record.cameras), record.projector) == ({"cam0": Size(64, 48)}, Size(64, 40))
     place = bench.calibrations.store.pose(session_id, 1)
     assert {path.name for path in place.iterdir()} == {
-        "bundle", "answer.json", "picture-cam0.png", "reading.npz", "record.json",
+        "bundle", "answer.json", "files.json", "picture-cam0.png", "reading.npz", "record.json",
     }  # fmt: skip
     assert (place / "picture-cam0.png").read_bytes() == PNG
 

@@ -16,6 +16,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from uuid import UUID, uuid4
 
+import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
@@ -28,7 +29,7 @@ from slrig.errors import DataFolderGoneError, DeviceGoneError, StorageError
 from slrig.failure import disk_errors
 from slrig.jobs import backup
 from slrig.jobs.backup import back_up, read_manifest, restore
-from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.data_folder import FILES, DataFolder, FileEntry, damaged_files, write_entries
 from slrig.jobs.database import Database
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import JobKind, JobRecord, JobState, utc_now, write_record
@@ -156,8 +157,8 @@ def test_each_file_of_a_scan_is_brought_to_disk_once(folder: DataFolder, monkeyp
     folder.put(scan_id, folder.scan(scan_id))
     files = (recording / "000.png", staged / "mesh.ply")
     assert [synced.count(path) for path in (*files, recording, folder.scans)] == [1, 1, 1, 1]
-    # The bundle's name, and then those of the results.
-    assert synced.count(staged) == 2
+    # The bundle's name, that of the list of files, and then those of the results.
+    assert synced.count(staged) == 3
     assert not [path for path in synced if path.is_relative_to(staged / "bundle")]
 
 
@@ -168,7 +169,7 @@ def test_committed_scan_has_its_results_beside_its_bundle(folder: DataFolder) ->
     result.mkdir()
     (result / "mesh.ply").write_bytes(b"ply")
     folder.put(scan_id, folder.scan(scan_id))
-    assert {path.name for path in folder.scan(scan_id).iterdir()} == {"bundle", "mesh.ply"}
+    assert {path.name for path in folder.scan(scan_id).iterdir()} == {"bundle", FILES, "mesh.ply"}
     assert list(folder.incoming.iterdir()) == []
 
 
@@ -218,7 +219,7 @@ def test_start_keeps_the_whole_bundle_of_a_reconstruction_that_was_cut_off_twice
     (folder.staging(scan_id) / "result.part").mkdir()
     settled(store, folder)
     assert store.get(scan_id).state is JobState.INTERRUPTED
-    assert [path.name for path in folder.scan(scan_id).iterdir()] == ["bundle"]
+    assert {path.name for path in folder.scan(scan_id).iterdir()} == {"bundle", FILES}
 
 
 @pytest.mark.parametrize("whole", [True, False])
@@ -258,6 +259,65 @@ def test_start_says_when_the_files_of_a_scan_are_gone(
     assert record.state is JobState.FAILED
     assert record.fault is not None
     assert record.fault.message.startswith(f"{' and '.join(gone)} of this reconstruction is gone")
+
+
+@pytest.mark.parametrize("name", ["mesh.ply", "report.json", FILES])
+@pytest.mark.parametrize("damage", ["cut", "emptied", "removed", "a folder"])
+def test_start_says_which_files_of_a_scan_are_damaged(
+    store: JobStore, folder: DataFolder, name: str, damage: str
+) -> None:
+    scan_id = running(store, JobState.COMPUTING)
+    finished(folder, store.get(scan_id))
+    write_entries(folder.scan(scan_id))
+    assert store.finish(scan_id, JobState.SUCCEEDED, summary=SUMMARY)
+    assert settled(store, folder) == {}
+    path = folder.scan(scan_id) / name
+    content = path.read_bytes()
+    path.unlink()
+    if damage == "a folder":
+        path.mkdir()
+    elif damage != "removed":
+        path.write_bytes(content[:-1] if damage == "cut" else b"")
+    settled(store, folder)
+    record = store.get(scan_id)
+    if (name, damage) == (FILES, "removed"):
+        # A folder of an earlier version, which had no list.
+        assert record.state is JobState.SUCCEEDED
+        return
+    assert (record.state, record.fault is None) == (JobState.FAILED, False)
+    assert record.fault is not None
+    assert name in record.fault.message
+
+
+def test_every_changed_bit_is_found_and_no_file_that_came_later(tmp_path: Path) -> None:
+    (tmp_path / "bundle").mkdir()
+    for name in ("mesh.ply", "bundle/000.png"):
+        (tmp_path / name).write_bytes(bytes(range(50)))
+    write_entries(tmp_path)
+    (tmp_path / "mesh.obj").write_text("made on request")
+    assert damaged_files(tmp_path, digests=True) == {}
+    rng = np.random.default_rng(7)
+    for name in ("mesh.ply", "bundle/000.png"):
+        for bit in rng.choice(400, 20, replace=False):
+            changed = bytearray(range(50))
+            changed[bit // 8] ^= 1 << (bit % 8)
+            (tmp_path / name).write_bytes(changed)
+            assert damaged_files(tmp_path, digests=True) == {name: "was changed"}
+            assert damaged_files(tmp_path, digests=False) == {}
+        (tmp_path / name).write_bytes(bytes(range(50)))
+
+
+def test_a_damaged_file_is_in_no_backup(tmp_path: Path, store: JobStore, folder: DataFolder) -> None:
+    scan_id = running(store, JobState.COMPUTING)
+    finished(folder, store.get(scan_id))
+    write_entries(folder.scan(scan_id))
+    store.finish(scan_id, JobState.SUCCEEDED, summary=SUMMARY)
+    (folder.scan(scan_id) / "mesh.ply").write_bytes(b"plz")
+    made = backup.back_up(folder.root, tmp_path / "backup")
+    assert f"scans/{scan_id}/mesh.ply: is damaged" in made.left_out
+    assert f"scans/{scan_id}/mesh.ply" not in made.files
+    assert f"scans/{scan_id}/report.json" in made.files
+    assert not list((tmp_path / "backup").rglob("mesh.ply"))
 
 
 def test_start_puts_finished_scans_on_record_again_beside_a_database_that_was_lost(
@@ -455,7 +515,7 @@ def while_copying(monkeypatch: pytest.MonkeyPatch, name: str, happens: Callable[
     copied = backup._copied
     waiting = [happens]
 
-    def first(source: Path, to: Path) -> backup.FileEntry:
+    def first(source: Path, to: Path) -> FileEntry:
         if source.name == name and waiting:
             waiting.pop()()
         return copied(source, to)

@@ -20,6 +20,7 @@ from slrig.calibrate.job import Calibrations, PoseRequest
 from slrig.calibrate.verification import HealthStore, RigHealth, VerificationJob
 from slrig.doctor import DoctorJob
 from slrig.errors import DeviceGoneError, OutOfMemoryError, RigBusyError, ScanCancelledError, ScanInterruptedError
+from slrig.jobs.data_folder import FILES
 from slrig.jobs.records import JobKind, JobRecord, JobState
 from slrig.model_jobs.job import TURNTABLE, Models
 from slrig.model_jobs.plan import ModelPlan, StatedAxis, TurntablePoses
@@ -341,7 +342,7 @@ def test_mathematics_that_fails_fails_the_job_alone(service: Service, kind: Kind
     assert (record.state, failure_code(record)) == (JobState.FAILED, "out-of-memory")
     assert list(service.folder.incoming.iterdir()) == []
     if kind.keeps:
-        assert [path.name for path in service.folder.scan(record.id).iterdir()] == ["bundle"]
+        assert {path.name for path in service.folder.scan(record.id).iterdir()} == {"bundle", FILES}
     assert_well(service, kind)
 
 

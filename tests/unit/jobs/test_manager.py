@@ -28,7 +28,7 @@ from slrig.errors import (
 )
 from slrig.failure import JobFailure, interruption_error
 from slrig.jobs import manager as managing
-from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.data_folder import FILES, DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.job import Job, JobRun, Outcome, Recording
 from slrig.jobs.records import Holder, JobKind, JobRecord, JobState, holder_of
@@ -393,7 +393,7 @@ def test_both_parts_are_done_in_turn_and_the_job_has_its_summary(tame: JobBench)
     assert tame.projector.dark
     assert list(tame.folder.incoming.iterdir()) == []
     files = {path.name for path in tame.folder.scan(record.id).iterdir()}
-    assert files == {"bundle", "found.txt", "record.json"}
+    assert files == {"bundle", FILES, "found.txt", "record.json"}
 
 
 def test_the_rig_is_free_before_the_frames_are_on_the_disk(tame: JobBench) -> None:
@@ -419,9 +419,9 @@ def test_the_rig_is_free_before_the_frames_are_on_the_disk(tame: JobBench) -> No
         (Steps(capture_error=OSError(5, "I/O")), JobState.FAILED, "device", []),
         (Steps(capture_error=ScanCancelledError("asked")), JobState.CANCELLED, "scan-cancelled", []),
         (Steps(capture_error=interruption_error()), JobState.INTERRUPTED, "scan-interrupted", []),
-        (Steps(recording_error=StorageError("full")), JobState.FAILED, "storage", ["bundle"]),
-        (Steps(compute_error=WorkerLostError("killed")), JobState.FAILED, "worker-lost", ["bundle"]),
-        (Steps(compute_error=ZeroDivisionError("secret")), JobState.FAILED, "unexpected", ["bundle"]),
+        (Steps(recording_error=StorageError("full")), JobState.FAILED, "storage", ["bundle", FILES]),
+        (Steps(compute_error=WorkerLostError("killed")), JobState.FAILED, "worker-lost", ["bundle", FILES]),
+        (Steps(compute_error=ZeroDivisionError("secret")), JobState.FAILED, "unexpected", ["bundle", FILES]),
         (Steps(outcome=Outcome({"found": 0}, REFUSED)), JobState.FAILED, "pose-refused", None),
     ],
 )
@@ -437,7 +437,7 @@ def test_whatever_happens_the_job_has_one_end_with_its_cause(
     assert list(tame.folder.incoming.iterdir()) == []
     place = tame.folder.scan(record.id)
     files = sorted(path.name for path in place.iterdir()) if place.exists() else []
-    assert files == (["bundle", "found.txt", "record.json"] if kept is None else kept)
+    assert files == (["bundle", FILES, "found.txt", "record.json"] if kept is None else kept)
 
 
 def test_job_that_is_cancelled_with_its_last_frame_is_cancelled(tame: JobBench) -> None:
@@ -486,7 +486,7 @@ def test_what_has_ended_the_service_twice_is_not_begun_a_third_time(tame: JobBen
     assert tame.store.get(record.id).state is JobState.INTERRUPTED
     assert work.done == ["came to nothing"]
     assert list(tame.folder.incoming.iterdir()) == []
-    assert [path.name for path in tame.folder.scan(record.id).iterdir()] == ["bundle"]
+    assert {path.name for path in tame.folder.scan(record.id).iterdir()} == {"bundle", FILES}
 
 
 def test_only_the_end_was_not_on_record_of_a_job_whose_files_are_in_place(tame: JobBench) -> None:

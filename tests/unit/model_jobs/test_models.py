@@ -27,6 +27,7 @@ from slrig.errors import (
     ViewsFailedError,
 )
 from slrig.failure import interruption_error, job_failure
+from slrig.jobs.data_folder import FILES
 from slrig.jobs.job import Recording
 from slrig.jobs.records import RECORD, JobKind, JobProgress, JobRecord, JobState, utc_now, write_record
 from slrig.jobs.resume import resume
@@ -75,7 +76,7 @@ def test_a_model_is_made_of_scans_on_a_stage_and_lies_in_its_place(bench: ModelB
     assert list(meshes) == [str(scan) for scan in scans]
     assert [mesh.read_bytes() for mesh in meshes.values()] == [b"ply"] * 3
     assert (poses, start_error_mm, voxel_mm) == (used.poses, 3.0, 0.4)
-    assert {file.name for file in bench.models.place(made.id).iterdir()} == {*MEDIA_TYPES, RECORD}
+    assert {file.name for file in bench.models.place(made.id).iterdir()} == {*MEDIA_TYPES, RECORD, FILES}
     assert done.summary == {
         "views": 3, "pairs": 2, "free": 0, "pose_sigma_mm": 0.004, "vertices": 9, "triangles": 12, "voxel_mm": 0.5,
         "sigma_mm": 0.01,
