@@ -237,11 +237,11 @@ class ServiceSettings(BaseSettings):
     `allowed_hosts` are names, in addition to `host` and those of this machine, that a request may have as its Host; in
     the environment they are separated by commas. `webhook_url` receives notices of `webhook_kinds`, all by default,
     signed with `webhook_secret` or the text in `webhook_secret_file`. `mqtt_url` is a broker that receives all notices,
-    with the user and password of `mqtt_login` or `mqtt_login_file`. Without an address nothing is sent. Beyond the
-    newest `keep_calibrations`, calibrations are removed with their poses, except the one in use and those that a scan
-    or an acceptance test names. Scans are kept unless `keep_scans` (their number), `keep_scans_days` or
-    `keep_scans_bytes` sets a limit: beyond it the oldest are removed, except pinned ones and those whose files were
-    requested in the last quarter of an hour. The newest `keep_models` are kept. `backlog_length` is the number of scans
+    with the user and password of `mqtt_login` or `mqtt_login_file`. Without an address nothing is sent. Nothing is
+    removed unless a setting sets a limit: `keep_calibrations`, `keep_models`, `keep_scans` (their numbers),
+    `keep_scans_days`, `keep_scans_bytes`. Beyond it the oldest are removed, failed ones first and counted apart, except
+    pinned ones, those whose files were requested in the last quarter of an hour, and calibrations that are in use or
+    that a scan or an acceptance test names. `backlog_length` is the number of scans
     that may be reconstructed, or wait for that, while the rig captures the next one; other computations count too.
     `drain_s` is the time after SIGTERM in which the job that has the rig and those that compute may end before they are
     interrupted; jobs that wait, or have all their frames, continue at the next start. `compute` is the scheduler of a
@@ -277,9 +277,8 @@ class ServiceSettings(BaseSettings):
     shutdown_s: Annotated[float, Field(gt=0)] = 3.0
     idempotency_keep_s: Annotated[float, Field(gt=0)] = 86400.0
     page_limit: Annotated[int, Field(ge=1, le=1000)] = 200
-    keep_calibrations: Annotated[int, Field(ge=1, le=100_000)] = 100
-    # Some dozen MB each, of scans that may be removed already.
-    keep_models: Annotated[int, Field(ge=1, le=100_000)] = 100
+    keep_calibrations: Annotated[int, Field(ge=1, le=100_000)] | None = None
+    keep_models: Annotated[int, Field(ge=1, le=100_000)] | None = None
     keep_scans: Annotated[int, Field(ge=1)] | None = None
     keep_scans_days: Annotated[float, Field(gt=0)] | None = None
     keep_scans_bytes: Annotated[int, Field(ge=1)] | None = None

@@ -109,6 +109,7 @@ class ModelBody(JobBody):
     """A model on record. `plan` has the axis and the angles that it is made with."""
 
     plan: ModelPlan
+    pinned: bool = Field(description="kept, whatever the settings say of old models")
     links: JobLinks
 
 
@@ -159,6 +160,18 @@ def cancel_model(service: Serving, model_id: UUID) -> ModelBody:
     return model_body(service, service.shooting.cancel(model_id))
 
 
+@router.put("/{model_id}/pin")
+def pin_model(service: Serving, model_id: UUID) -> ModelBody:
+    """Keep a model, whatever the settings say of old ones. DELETE lets it go the way of the others again."""
+    return model_body(service, service.store.pin(model_id, JobKind.MODEL, pinned=True))
+
+
+@router.delete("/{model_id}/pin")
+def unpin_model(service: Serving, model_id: UUID) -> ModelBody:
+    """Let a model be removed when it is old, where the settings ask for that."""
+    return model_body(service, service.store.pin(model_id, JobKind.MODEL, pinned=False))
+
+
 @router.delete("/{model_id}", status_code=204, responses=problems(409, 507))
 def delete_model(service: Serving, model_id: UUID) -> None:
     """Delete a model that is over with all its files. Its scans stay."""
@@ -171,6 +184,7 @@ def _serve(name: str, media_type: str) -> Callable[..., Response]:
         record, path = service.store.get(model_id, JobKind.MODEL), service.models.place(model_id) / name
         if record.state is not JobState.SUCCEEDED or not service.folder.owns(path):
             refuse_absent(record, name)
+        service.retentions[JobKind.MODEL].reading(model_id)
         require_whole(service, record, path.parent, name)
         return kept_file(path, media_type, model_id, known)
 

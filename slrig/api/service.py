@@ -38,11 +38,11 @@ from slrig.jobs.records import (
     utc_now,
 )
 from slrig.jobs.resume import resume
+from slrig.jobs.retention import CLOCK, JobRetention, Limits, SteadyClock
 from slrig.jobs.store import Audit, AuditEntry, JobStore, RequestKeys
 from slrig.model_jobs.job import TURNTABLE, Models, ViewShooting
 from slrig.model_jobs.turntable import TurntableStore
 from slrig.plugins import OBSERVERS, load
-from slrig.scan.job import ScanLimits, ScanRetention
 from slrig.scan.plan import Presets
 from slrig.schedule.notices import NoticedHealth, senders_of, tell_run
 from slrig.schedule.scheduler import Scheduler, Tasks
@@ -191,7 +191,7 @@ class Service:
         self.turntable = TurntableStore(self.folder.root / TURNTABLE)
         spare_bytes = settings.min_free_bytes
         manager.groups[JobKind.AXIS] = self.turntable
-        self.models = Models(manager, turntable=self.turntable, keep=settings.keep_models, spare_bytes=spare_bytes)
+        self.models = Models(manager, turntable=self.turntable, spare_bytes=spare_bytes)
         self.shooting = ViewShooting(self.models, manager)
         self.durations = Durations()
         self.observers = [each for observe in load(OBSERVERS).values() if (each := observe()) is not None]
@@ -199,7 +199,6 @@ class Service:
         self.acceptance.settle()
         resume(manager)
         self.shooting.take_up()
-        self.models.remove_old()
         self.store.after_end = self._ended
         self.retention = Retention(
             self.calibrations,
@@ -209,8 +208,17 @@ class Service:
         )
         self.copier = self._copier()
         self._tellers = (*self.senders, *(() if self.copier is None else (self.copier,)))
-        limits = ScanLimits(settings.keep_scans, settings.keep_scans_days, settings.keep_scans_bytes)
-        self.scan_retention = ScanRetention(self.store, self.folder, limits, self.delete_scan)
+        finished = self.store.finished(JobKind.SCAN)[:1]
+        clock = SteadyClock(self.folder.root / CLOCK, first=finished[0].finished_at if finished else None)
+        limits = Limits(settings.keep_scans, settings.keep_scans_days, settings.keep_scans_bytes)
+        self.retentions = {
+            JobKind.SCAN: JobRetention(
+                self.store, JobKind.SCAN, limits, self.folder.scan, self.delete_scan, clock=clock.now
+            ),
+            JobKind.MODEL: JobRetention(
+                self.store, JobKind.MODEL, Limits(settings.keep_models), self.models.place, self.manager.delete
+            ),
+        }
         self.schedules = ScheduleStore(database, notice=partial(tell_run, outbox))
         self.tasks = Tasks(manager, self.calibrations, self.acceptance, tidy=self.retention)
         # The folder's lock keeps every other process out.
@@ -235,7 +243,8 @@ class Service:
         """Measure a job that is over, make room, and go on with the model that a scan is a view of."""
         if record.kind is JobKind.SCAN:
             self.shooting.view_ended(record)
-            self.scan_retention.look()
+        if record.kind in self.retentions:
+            self.retentions[record.kind].look()
         try:
             if record.kind is JobKind.VERIFICATION or record.kind in RIG_JOBS:
                 self.store.prune(record.kind, _MOST_ON_RECORD)
@@ -253,7 +262,8 @@ class Service:
         self.manager.start()
         self.scheduler.start()
         # It reads the report of every scan, and nobody waits for it.
-        self.scan_retention.start()
+        for retention in self.retentions.values():
+            retention.start()
         self._lasting = _lasting_threads()
         threading.Thread(target=self.retention, name="slrig-retention", daemon=True).start()
 
@@ -269,7 +279,8 @@ class Service:
 
     def end_work(self) -> None:
         """Stop scanning and calibrating, and record what was cut off. Idempotent."""
-        self.scan_retention.close()
+        for retention in self.retentions.values():
+            retention.close()
         self.scheduler.stop()
         self.tasks.end()
         self.scheduler.close(timeout_s=min(_SCHEDULE_END_S, self.settings.shutdown_s))

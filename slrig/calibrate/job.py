@@ -823,17 +823,22 @@ def _position(asked: int | str | None, facts: RigFacts | None) -> tuple[int | No
 class Retention:
     """Keeps the newest calibrations of a data folder, and those that are needed. Any thread may call.
 
-    keep : so many are kept whatever they are. named : further names of calibrations that are needed.
+    keep : so many are kept whatever they are, those without a solve counted apart; None for all.
+    named : further names of calibrations that are needed.
     """
 
     calibrations: Calibrations
     folder: DataFolder
-    keep: int
+    keep: int | None
     named: Callable[[], set[str]] = set
 
     def __call__(self) -> tuple[UUID, ...]:
         """Remove what is neither new nor needed, say so in the log, and return which."""
-        old = [record for record in self.calibrations.latest()[self.keep :] if not record.under_way]
+        if self.keep is None:
+            return ()
+        records = self.calibrations.latest()
+        kinds = ([each for each in records if each.solve], [each for each in records if not each.solve])
+        old = [each for kind in kinds for each in kind[self.keep :] if not each.under_way]
         if not old:
             return ()
         needed = named_by_scans(self.folder.scans) | {_session_of(name) for name in self.named()}

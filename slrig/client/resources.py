@@ -187,6 +187,14 @@ class Models(Resource):
         """Delete a finished model with all its files."""
         self._connection.send("DELETE", path("/model/{}", model_id))
 
+    def pin(self, model_id: str) -> Json:
+        """Keep a model, even where the settings delete old ones."""
+        return self._connection.json("PUT", path("/model/{}/pin", model_id))
+
+    def unpin(self, model_id: str) -> Json:
+        """Let the settings delete a model once it is old."""
+        return self._connection.json("DELETE", path("/model/{}/pin", model_id))
+
     def cancel(self, model_id: str) -> Json:
         """Stop a model."""
         return self._connection.json("POST", path("/model/{}/cancel", model_id))

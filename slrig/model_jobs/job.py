@@ -179,18 +179,16 @@ def turntable_planes(mesh: Path, axis: MeasuredAxis | None) -> tuple[TurntablePl
 
 
 class Models:
-    """Has models made, and keeps the newest: the `Group` of models. Any thread may call.
+    """Has models made: the `Group` of models. Any thread may call.
 
-    turntable : knows its axis and planes, and learns of each model's axis. keep : so many models are kept.
-    spare_bytes : left free on the disk.
+    turntable : knows its axis and planes, and learns of each model's axis. spare_bytes : left free on the disk.
     """
 
-    def __init__(self, manager: JobManager, *, turntable: TurntableStore, keep: int, spare_bytes: int = 0) -> None:
+    def __init__(self, manager: JobManager, *, turntable: TurntableStore, spare_bytes: int = 0) -> None:
         self.jobs = manager.store
         self._manager = manager
         self._data = manager.data
         self._turntable = turntable
-        self._keep = keep
         self._spare_bytes = spare_bytes
         # Held while scans are looked up and named by a job, and while one is deleted.
         self._naming = threading.Lock()
@@ -229,7 +227,6 @@ class Models:
                 raise QueueFullError(message)
             self._require_space(used)
             record = self._manager.submit(ModelJob(used), label=label, key=key)[0]
-        self.remove_old()
         return self.jobs.get(record.id)
 
     def begin(self, record: JobRecord, plan: ModelPlan) -> None:
@@ -239,7 +236,6 @@ class Models:
             self._require_space(used)
             record = self.jobs.replan(record.id, plan_json(used))
         self._manager.begin(ModelJob(used), record)
-        self.remove_old()
 
     def with_axis(self, plan: ModelPlan) -> ModelPlan:
         """The plan with the turntable's axis in it, where it leaves that to the turntable. Raises ConfigError."""
@@ -340,17 +336,6 @@ class Models:
             except Exception:  # noqa: BLE001 - the model is there, and is no worse for that
                 _log.exception("the axis of a model could not be noted", model=str(job_id))
         return outcome
-
-    def remove_old(self) -> None:
-        """Remove the oldest models beyond those that are kept, and say so in the log."""
-        for record in self.jobs.finished(JobKind.MODEL)[self._keep :]:
-            try:
-                self._manager.delete(record.id)
-            except JobNotFoundError:
-                # Deleted by somebody meanwhile.
-                continue
-            except StorageError as error:
-                _log.warning("an old model could not be removed", model=str(record.id), cause=str(error))
 
     def _require_space(self, plan: ModelPlan) -> None:
         mesh_bytes = sum(self._mesh(scan).stat().st_size for scan in plan.scans)

@@ -426,8 +426,8 @@ def a_scan(bench: CalibrationBench, *, report: object = None, bundle: UUID | Non
 
 
 def test_only_what_is_neither_new_nor_needed_is_removed(bench: CalibrationBench) -> None:
-    in_report, twice, in_bundle, active, empty, unused, newest = (
-        *(bench.solved() for _ in range(4)), bench.session(), bench.solved(), bench.session(),
+    in_report, twice, in_bundle, active, empty, unused, begun, newest = (
+        *(bench.solved() for _ in range(4)), bench.session(), bench.solved(), bench.session(), bench.solved(),
     )  # fmt: skip
     bench.solve(twice)
     bench.calibrations.activate(active)
@@ -440,12 +440,13 @@ def test_only_what_is_neither_new_nor_needed_is_removed(bench: CalibrationBench)
     places = [bench.calibrations.store.folder(each) for each in (empty, unused)]
     assert all(place.is_dir() for place in places)
     assert Retention(bench.calibrations, bench.folder, keep=7)() == ()
+    assert Retention(bench.calibrations, bench.folder, keep=None)() == ()
     with capture_logs() as log:
         assert Retention(bench.calibrations, bench.folder, keep=1)() == (empty, unused)
     told = [each["calibration"] for each in log if each["event"] == "old calibration removed"]
     assert told == [str(empty), str(unused)]
     assert not any(place.exists() for place in places)
-    assert [record.id for record in bench.calibrations.latest()] == [newest, active, in_bundle, twice, in_report]
+    assert [record.id for record in bench.calibrations.latest()] == [newest, begun, active, in_bundle, twice, in_report]
     assert Retention(bench.calibrations, bench.folder, keep=1)() == ()
 
 
@@ -469,7 +470,7 @@ def test_one_that_states_no_error_is_known_by_its_numbers(bench: CalibrationBenc
         document = json.loads(given.read_text())
         document.pop("solved")
         imported.append(bench.calibrations.submit(json.dumps(document).encode(), ".json").id)
-    bench.session()
+    bench.solved()
     a_scan(bench, report={"calibration": {"id": kept.digest}})
     assert named_by_scans(bench.folder.scans) == {kept.digest}
     tidy = Retention(bench.calibrations, bench.folder, keep=1, named=lambda: {gone.digest})

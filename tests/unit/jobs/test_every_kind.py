@@ -84,7 +84,7 @@ class Service(Bench):
         health = RigHealth(self.manager.rig, HealthStore(self.store.database), self.folder)
         self.manager.groups[JobKind.VERIFICATION] = health
         self.calibrations = Calibrations(self.manager)
-        self.models = Models(self.manager, turntable=TurntableStore(self.folder.root / TURNTABLE), keep=100)
+        self.models = Models(self.manager, turntable=TurntableStore(self.folder.root / TURNTABLE))
         self.acceptance = AcceptanceTests(self.manager)
         self.manager.rig.use_calibration(ActiveCalibration("spring", tame_calibration()))
         self.manager.start()

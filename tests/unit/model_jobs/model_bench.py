@@ -108,7 +108,7 @@ def model_files(
 class ModelBench(Bench):
     """Models over a tame bench. start : begin at once; else what is on record waits for that."""
 
-    def __init__(self, root: Path, *, keep: int = 100, start: bool = True, axis: MeasuredAxis | None = None) -> None:
+    def __init__(self, root: Path, *, start: bool = True, axis: MeasuredAxis | None = None) -> None:
         put_database(root / "data" / "slrig.sqlite")
         super().__init__(root)
         self.tame = TameCombining()
@@ -116,14 +116,13 @@ class ModelBench(Bench):
         self.turntable = TurntableStore(self.folder.root / TURNTABLE)
         if axis is not None:
             self.turntable.put_axis(axis, source=AxisSource.BOARD, of="a board")
-        self.models = Models(self.manager, turntable=self.turntable, keep=keep)
+        self.models = Models(self.manager, turntable=self.turntable)
         if start:
             self.start()
 
     def start(self) -> None:
         """Go on with what is on record."""
         resume(self.manager)
-        self.models.remove_old()
         self.manager.start()
 
     def delete_scan(self, scan_id: UUID) -> None:

@@ -31,6 +31,7 @@ from slrig.jobs.data_folder import FILES
 from slrig.jobs.job import Recording
 from slrig.jobs.records import RECORD, JobKind, JobProgress, JobRecord, JobState, utc_now, write_record
 from slrig.jobs.resume import resume
+from slrig.jobs.retention import JobRetention, Limits
 from slrig.model import MeasuredAxis, PlaneKind, TurntablePlane
 from slrig.model_jobs.job import ViewShooting
 from slrig.model_jobs.plan import (
@@ -45,9 +46,9 @@ from slrig.model_jobs.plan import (
     plan_from_json,
     plan_json,
 )
-from slrig.scan.job import ScanLimits, ScanRetention, series
 from slrig.scan.job import plan_from_json as scan_plan_from_json
 from slrig.scan.job import plan_json as scan_plan_json
+from slrig.scan.job import series
 from slrig.scan.plan import ScanPlan
 from tests.unit.capture.fake_rig import FakeTurntable
 from tests.unit.model_jobs.model_bench import ModelBench, kept_scan, model_files, until_told
@@ -151,7 +152,7 @@ def test_what_cannot_be_made_is_refused_before_it_is_on_record(bench: ModelBench
 
 def test_scans_that_a_model_needs_stay_until_it_is_over(bench: ModelBench) -> None:
     scans = bench.kept_scans(0.0, 40.0)
-    retention = ScanRetention(bench.store, bench.folder, ScanLimits(count=1), bench.delete_scan)
+    retention = JobRetention(bench.store, JobKind.SCAN, Limits(count=1), bench.folder.scan, bench.delete_scan)
     bench.tame.gate.clear()
     plan = ModelPlan(scans, TurntablePoses(AXIS))
     models = [bench.models.combine(plan) for _ in range(2)]
@@ -169,16 +170,13 @@ def test_scans_that_a_model_needs_stay_until_it_is_over(bench: ModelBench) -> No
     assert list(bench.folder.incoming.iterdir()) == []
 
 
-def test_the_newest_models_are_kept(tmp_path: Path) -> None:
-    bench = ModelBench(tmp_path, keep=2)
+def test_models_beyond_the_limit_go_with_their_files(bench: ModelBench) -> None:
     plan = ModelPlan(bench.kept_scans(0.0, 40.0), TurntablePoses(AXIS))
-    made = [bench.over(bench.models.combine(plan).id).id for _ in range(4)]
-    # The one that is asked for makes room when it is over.
-    assert sorted(bench.store.states(JobKind.MODEL)) == sorted(made[1:])
-    bench.manager.delete(made[2])
-    kept = {each.name for each in bench.models.place(made[0]).parent.iterdir()}
-    assert kept == {str(made[1]), str(made[3])}
-    bench.close()
+    made = [bench.over(bench.models.combine(plan).id).id for _ in range(3)]
+    bench.store.pin(made[0], JobKind.MODEL, pinned=True)
+    retention = JobRetention(bench.store, JobKind.MODEL, Limits(count=1), bench.models.place, bench.manager.delete)
+    assert retention.apply() == [made[1]]
+    assert {each.name for each in bench.models.place(made[0]).parent.iterdir()} == {str(made[0]), str(made[2])}
 
 
 def cut_off(bench: ModelBench, *, attempts: int, files: bool = False) -> UUID:
