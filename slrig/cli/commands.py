@@ -34,7 +34,7 @@ from slrig.cli.options import (
     grouped,
     period_option,
 )
-from slrig.cli.service import Data, backup, fleet, key_app, pool_app, restore, serve, worker
+from slrig.cli.service import Data, backup, check, fleet, key_app, pool_app, restore, serve, worker
 from slrig.errors import ConfigError, SlrigError
 
 if TYPE_CHECKING:
@@ -657,6 +657,7 @@ app.command()(model)
 app.command()(patterns)
 app.command(name="import")(import_images)
 app.command()(backup)
+app.command()(check)
 app.command()(restore)
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(schedule.app, name="schedule")

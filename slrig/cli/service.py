@@ -243,6 +243,39 @@ def backup(
     _tell(back_up(folder, to, previous=link_previous), f"backup of {folder} in {to}", as_json=as_json)
 
 
+def check(
+    data: Annotated[Path, typer.Argument(metavar="DATA", help="The data folder of a service.")],
+    as_json: AsJson = False,
+) -> None:
+    """Compare every file of a data folder with what was committed.
+
+    Also while the service runs. Exits with 1 if a file is damaged.
+    """
+    from slrig.errors import ConfigError
+    from slrig.jobs.data_folder import SCANS, check_files
+
+    if not (data / SCANS).is_dir():
+        message = f"{data}: no data folder of slrig; expected one with a folder '{SCANS}'."
+        raise ConfigError(message)
+    looked_at, found = 0, {}
+    for path, cause in check_files(data):
+        looked_at += 1
+        if cause is not None:
+            found[path] = cause
+    if as_json:
+        from slrig.cli.display import print_json
+
+        print_json({"files": looked_at, "damaged": found})
+    else:
+        for path, cause in found.items():
+            typer.echo(f"{path} {cause}")
+        typer.echo(f"{looked_at} files of finished jobs, {len(found) or 'none'} damaged")
+        if found:
+            typer.echo("Where the bundle is whole: POST /scan/ID/reconstruct. Otherwise restore a backup.", err=True)
+    if found:
+        raise typer.Exit(1)
+
+
 def restore(
     source: Annotated[Path, typer.Argument(metavar="FROM", help="A backup.")],
     data: Annotated[Path, typer.Option(help="The data folder to make: new, or empty.")],

@@ -20,7 +20,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,6 +106,23 @@ def damaged_files(folder: Path, *, digests: bool, names: Iterable[str] | None = 
         except OSError as error:
             found[name] = "is gone" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
     return found
+
+
+def check_files(root: Path) -> Iterator[tuple[str, str | None]]:
+    """Compare every file of the finished jobs of a data folder with what was committed, while a service runs or not:
+    each by its path in the folder, and what is wrong with it, None if nothing is.
+    """
+    for entries in sorted(root.rglob(FILES)):
+        place = entries.parent.relative_to(root)
+        if not place.parts or place.parts[0].startswith("."):
+            continue
+        names = read_entries(entries.parent)
+        found = damaged_files(entries.parent, digests=True)
+        if found and not entries.exists():
+            # The job was deleted meanwhile.
+            continue
+        for name in sorted({*names, *found}):
+            yield (place / name).as_posix(), found.get(name)
 
 
 def damage(what: str, found: Mapping[str, str], remedy: str) -> DamagedError:

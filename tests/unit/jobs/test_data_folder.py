@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import stat
 import subprocess
@@ -38,6 +39,7 @@ from slrig.jobs.store import JobStore
 from slrig.rig.session import RigSession
 from slrig.scan.job import plan_from_json, plan_json
 from slrig.scan.plan import ScanPlan
+from tests.unit.command import refused, slrig
 from tests.unit.jobs.tame_compute import TameCompute
 from tests.unit.scan.bench import PIPELINE, failure_code
 
@@ -305,6 +307,33 @@ def test_every_changed_bit_is_found_and_no_file_that_came_later(tmp_path: Path) 
             assert damaged_files(tmp_path, digests=True) == {name: "was changed"}
             assert damaged_files(tmp_path, digests=False) == {}
         (tmp_path / name).write_bytes(bytes(range(50)))
+
+
+def test_check_names_each_damaged_file_of_a_data_folder(store: JobStore, folder: DataFolder) -> None:
+    places = []
+    for _ in range(2):
+        scan_id = running(store, JobState.COMPUTING)
+        finished(folder, store.get(scan_id))
+        places.append(folder.scan(scan_id))
+        write_entries(places[-1])
+    staged = folder.stage(uuid4())
+    write_entries(staged)
+    whole = slrig("check", folder.root)
+    assert (whole.exit_code, whole.stdout) == (0, "6 files of finished jobs, none damaged\n")
+    (places[0] / "mesh.ply").write_bytes(b"plz")
+    (places[1] / "report.json").unlink()
+    damaged = slrig("check", folder.root, "--json")
+    assert damaged.exit_code == 1
+    assert json.loads(damaged.stdout) == {
+        "files": 6,
+        "damaged": {
+            f"scans/{places[0].name}/mesh.ply": "was changed",
+            f"scans/{places[1].name}/report.json": "is gone",
+        },
+    }
+    (places[1] / FILES).write_bytes(b"{")
+    assert f"scans/{places[1].name}/{FILES} cannot be read" in slrig("check", folder.root).stdout
+    assert "no data folder" in refused(slrig("check", folder.root / "scans"))
 
 
 def test_a_damaged_file_is_in_no_backup(tmp_path: Path, store: JobStore, folder: DataFolder) -> None:
