@@ -406,6 +406,14 @@ def missing_files(place: Path, promised: Iterable[str]) -> list[str]:
     return [name for name in promised if not (is_ours and (place / name).is_file() and not (place / name).is_symlink())]
 
 
+def require_files(place: Path, promised: Iterable[str], noun: str) -> None:
+    """Raise StorageError where promised files of a job that was computed are not in a folder."""
+    if missing := missing_files(place, promised):
+        gone = " and ".join(missing)
+        message = f"The {noun} was computed, and {gone} is not on the disk. Check the disk, and start it again."
+        raise StorageError(message)
+
+
 def remove(path: Path) -> None:
     """Remove a file, a folder with all that is in it, or a link and not what it leads to. Raises OSError."""
     if path.is_dir() and not path.is_symlink():

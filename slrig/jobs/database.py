@@ -51,7 +51,8 @@ class Base(DeclarativeBase):
 
 class JobRow(Base):
     """One job of any kind. parent : the calibration or the acceptance test that it belongs to, if it belongs to one.
-    pinned : no retention removes it. requested_by : the name of the key, or the schedule, that asked for it.
+    pinned : no retention removes it. attempts : how often the worker began it. requested_by : the name of the key, or
+    the schedule, that asked for it.
     """
 
     __tablename__ = "job"
@@ -75,6 +76,7 @@ class JobRow(Base):
     summary: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
     last_event: Mapped[int] = mapped_column(Integer)
     pinned: Mapped[bool] = mapped_column(Boolean)
+    attempts: Mapped[int] = mapped_column(Integer, default=0, server_default="0")
     requested_by: Mapped[str | None] = mapped_column(String(80))
 
     __table_args__ = (

@@ -409,9 +409,13 @@ class ProgressRecorder:
         *,
         hidden: str,
         span: tuple[float, float] = (0.0, 1.0),
+        attempt: bool = False,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`hidden` is left out of what is recorded; the fractions told are of `span`, a part of the whole job."""
+        """`hidden` is left out of what is recorded; the fractions are of `span`, a part of the whole job. attempt : the
+        first stage that is not one of waiting counts as an attempt of the worker.
+        """
+        self._attempt = attempt
         self._now_s = now_s
         self._told_s = -math.inf
         self._hidden = hidden
@@ -432,6 +436,9 @@ class ProgressRecorder:
         """Take note, as `slrig.scan.plan.ProgressCallback` asks. A record that is refused fails no work: see the
         log.
         """
+        if self._attempt and not stage.startswith("waiting"):
+            self._attempt = False
+            self._recorded("that a job begins could not be recorded", lambda: self._store.begin_attempt(self._job_id))
         overall = self._start + (self._end - self._start) * min(max(fraction, 0.0), 1.0)
         since_s = self._now_s() - self._told_s
         goes_on = detail != self._told.detail and since_s >= _DETAIL_S

@@ -32,9 +32,10 @@ from slrig.errors import (
     ScanStateError,
     SlrigError,
     StorageError,
+    WorkerLostError,
 )
 from slrig.failure import UNEXPECTED, JobFailure, as_error, interruption_error, job_failure
-from slrig.jobs.data_folder import BUNDLE, DataFolder, missing_files, read_entries
+from slrig.jobs.data_folder import BUNDLE, DataFolder, read_entries, require_files
 from slrig.jobs.job import FrameFeed, Group, Job, JobRun, Outcome, ProgressRecorder, Recording, due_s
 from slrig.jobs.records import (
     Holder,
@@ -55,6 +56,9 @@ from slrig.rig.watchdog import Call, Watchdog
 
 RETRY_S = 2.0
 """Seconds until an end of a job that the disk refused to record is recorded again: clients may wait for it."""
+
+MAX_ATTEMPTS = 3
+"""So often the worker begins a job, where the worker or the service ends before the job."""
 
 _LOOK_S = 0.1
 """How often a drain looks whether it is over, or to be cut short."""
@@ -315,8 +319,8 @@ class JobManager:
         with self._changed:
             queued = next((work for work in self._waiting if work.id == job_id), None)
             if queued is not None:
-                self._waiting = _without(self._waiting, queued)
-                message = f"{_begun(queued.holder.words)} was cancelled while it waited for the rig."
+                self._waiting = tuple(each for each in self._waiting if each is not queued)
+                message = f"This {queued.job.noun} was cancelled while it waited for the rig."
                 self._end(queued, ScanCancelledError(message))
             under_way = [work for work in self._under_way() if work.id == job_id]
             for work in under_way:
@@ -552,7 +556,7 @@ class JobManager:
                     return None
                 if self._wanted():
                     self._active = self._due()[0]
-                    self._waiting = _without(self._waiting, self._active)
+                    self._waiting = tuple(each for each in self._waiting if each is not self._active)
                     return self._active
                 looks = self._previews.wanted
             if looks:
@@ -695,24 +699,31 @@ class JobManager:
             data.keep_recording(work.id)
         work.resumable = self._on_record_as_computing(work)
         with self._turns[job.parent] if job.one_at_a_time else nullcontext():
-            return self._computed_in_turn(work, progress)
+            return self._computed_in_turn(work)
 
-    def _computed_in_turn(self, work: _Work, progress: ProgressRecorder) -> Outcome:
+    def _computed_in_turn(self, work: _Work) -> Outcome:
+        tries = 1
+        while True:
+            try:
+                return self._computed_once(work)
+            except WorkerLostError as error:
+                # What ends the worker may be the job itself: it goes behind the others, and not for ever.
+                if self._ending or not work.resumable or tries == MAX_ATTEMPTS:
+                    raise
+                tries += 1
+                _log.warning("the worker was lost, and the job is computed once more", cause=str(error))
+
+    def _computed_once(self, work: _Work) -> Outcome:
         job, data = work.job, self.data
         data.clear_results(work.id)
-        run = self._run_of(work, progress)
+        run = self._run_of(work, self._progress(work, job.capture_share, 1.0, attempt=True))
         run.check()
         outcome: Outcome = self.worker.run(
             job_task(job, run), progress=run.report, cancelled=run.cancelled, made=run.file_ready, feed=work.feed
         )
         made = run.result if run.result.is_dir() else run.folder
-        missing = missing_files(made, job.promises)
-        if missing and outcome.fault is None:
-            message = (
-                f"The {job.noun} was computed, and {' and '.join(missing)} is not on the disk. Check the disk, and "
-                "start it again."
-            )
-            raise StorageError(message)
+        if outcome.fault is None:
+            require_files(made, job.promises, job.noun)
         return self._kept(work, outcome)
 
     def _kept(self, work: _Work, outcome: Outcome) -> Outcome:
@@ -748,8 +759,9 @@ class JobManager:
             found=found,
         )
 
-    def _progress(self, work: _Work, begin: float, end: float) -> ProgressRecorder:
-        return ProgressRecorder(self.store, work.id, hidden=self.data.hidden(work.id), span=(begin, end))
+    def _progress(self, work: _Work, begin: float, end: float, *, attempt: bool = False) -> ProgressRecorder:
+        hidden = self.data.hidden(work.id)
+        return ProgressRecorder(self.store, work.id, hidden=hidden, span=(begin, end), attempt=attempt)
 
     def _follow(self, work: _Work) -> None:
         """Have those jobs done that follow one whose frames are taken."""
@@ -984,12 +996,3 @@ def _busy(work: _Work) -> RigBusyError:
         "in line."
     )
     return RigBusyError(message, holder=holder.name, since=since)
-
-
-def _without(works: tuple[_Work, ...], work: _Work) -> tuple[_Work, ...]:
-    return tuple(each for each in works if each is not work)
-
-
-def _begun(words: str) -> str:
-    """The words as the beginning of a sentence."""
-    return words[:1].upper() + words[1:]

@@ -11,8 +11,11 @@ from slrig.errors import StorageError
 from slrig.failure import interruption_error, job_failure
 from slrig.jobs.data_folder import BUNDLE, damage, damaged_files, missing_files, remove
 from slrig.jobs.job import Job, Outcome
-from slrig.jobs.manager import JobManager
+from slrig.jobs.manager import MAX_ATTEMPTS, JobManager
 from slrig.jobs.records import JobRecord, JobState, acting_as, read_record
+
+MAX_TAKES = 10
+"""So often a job is lined up to be computed at most, where something ends the service before the worker begins it."""
 
 _log = structlog.get_logger(__name__)
 
@@ -21,8 +24,8 @@ def resume(manager: JobManager) -> None:
     """Settle every job that the last run left open, or have it go on. Once, before the manager starts.
 
     - A job whose files are in their place had only its end missing on record.
-    - One that waited waits again. One that computed is computed once more, from the frames that it has; what has ended
-      the service in the middle of the second attempt, too, may lie in those.
+    - One that waited waits again. One that computed, or waited for that, is computed from the frames that it has, until
+      the worker has begun it `MAX_ATTEMPTS` times: what ended the service each time may lie in those.
     - Any other was interrupted; its frames are kept if it keeps them and all had come.
     - A deletion that was cut off is completed.
     - A job that succeeded and lacks files is recorded as failed.
@@ -31,7 +34,8 @@ def resume(manager: JobManager) -> None:
     """
     store, data = manager.store, manager.data
     going_on = set()
-    for record in store.unfinished():
+    # What may have ended the service is the last in line.
+    for record in sorted(store.unfinished(), key=lambda each: store.attempts(each.id)):
         try:
             job = manager.kinds[record.kind].from_record(record)
             # A job that is not ready is continued by its group.
@@ -70,7 +74,8 @@ def _went_on(manager: JobManager, record: JobRecord, job: Job) -> bool:
     captured = record.state is JobState.COMPUTING and whole
     # A job without the rig has waited, also while its views were captured.
     waited = record.state is JobState.QUEUED or (not job.uses_rig and not captured)
-    if waited or (captured and store.attempts(record.id) == 1):
+    tried = store.attempts(record.id) >= MAX_ATTEMPTS or store.takes(record.id) >= MAX_TAKES
+    if waited or (captured and not tried):
         manager.begin(job, record, captured=captured)
         _note(record, "taken up again")
         return True

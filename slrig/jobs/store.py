@@ -362,7 +362,17 @@ class JobStore:
             return record_of(row)
 
     def attempts(self, job_id: UUID) -> int:
-        """How often the computing part of a job was begun."""
+        """How often the worker began a job. Raises JobNotFoundError."""
+        with self.database.reading() as session:
+            return self._find(session, job_id).attempts
+
+    def begin_attempt(self, job_id: UUID) -> None:
+        """Record that the worker begins a job. Raises JobNotFoundError, StorageError."""
+        with self.database.changing() as session:
+            self._find(session, job_id).attempts += 1
+
+    def takes(self, job_id: UUID) -> int:
+        """How often a job was lined up to be computed, whether the worker came to it or not."""
         states = [event.data["state"] for event in self.events(job_id, after=0) if event.kind == "state"]
         return states.count(JobState.COMPUTING)
 
@@ -386,6 +396,7 @@ class JobStore:
             if JobState(row.state).final:
                 # It is computed once more.
                 row.finished_at = row.summary = row.failure_code = row.failure_message = None
+                row.attempts = 0
             row.state = state
             now = self._now()
             row.started_at = row.started_at or now

@@ -366,7 +366,7 @@ def test_pose_that_waited_is_shot_after_a_restart_and_one_with_its_frames_is_rea
     record = bench.until_session(session_id, lambda found: not found.under_way)
     assert [pose.state for pose in record.poses] == [JobState.SUCCEEDED] * 4
     assert len(bench.captured) == 2
-    assert bench.store.attempts(waiting.id) == 1
+    assert bench.store.takes(waiting.id) == 1
 
 
 def test_poses_outlive_their_records_and_records_do_not_outlive_their_files(bench: CalibrationBench) -> None:

@@ -212,11 +212,12 @@ def test_what_waits_or_computes_goes_on(store: JobStore, folder: DataFolder) -> 
     assert (folder.staging(cut_off) / "bundle").is_dir()
 
 
-def test_start_keeps_the_whole_bundle_of_a_reconstruction_that_was_cut_off_twice(
+def test_start_keeps_the_whole_bundle_of_a_reconstruction_that_was_cut_off_three_times(
     store: JobStore, folder: DataFolder
 ) -> None:
     scan_id = running(store, JobState.COMPUTING)
-    store.advance(scan_id, JobState.COMPUTING)
+    for _ in range(3):
+        store.begin_attempt(scan_id)
     staged_bundle(folder, scan_id)
     (folder.staging(scan_id) / "result.part").mkdir()
     settled(store, folder)
@@ -428,7 +429,8 @@ def test_links_in_the_data_folder_are_neither_followed_nor_fatal(
     (folder.incoming / "to-nothing").symlink_to(elsewhere / "absent")
     cut = running(store, JobState.COMPUTING)
     (staged_bundle(folder, cut) / "frame.png").symlink_to(elsewhere / "absent")
-    store.advance(cut, JobState.COMPUTING)
+    for _ in range(3):
+        store.begin_attempt(cut)
     stray, linked, hollow = uuid4(), running(store, JobState.COMPUTING), running(store, JobState.COMPUTING)
     write_record(elsewhere, replace(store.get(cut), id=stray))
     folder.scan(stray).symlink_to(elsewhere)

@@ -56,6 +56,7 @@ class Steps:
     recording_error: Exception | None = None
     compute_error: Exception | None = None
     keep_error: Exception | None = None
+    workers_lost: int = 0
     outcome: Outcome = Outcome({"found": 1})  # noqa: RUF009 - frozen
     done: list[str] = field(default_factory=list)
     threads: list[str] = field(default_factory=list)
@@ -108,6 +109,9 @@ class SteppedJob(Job):
 
     def compute(self, run: JobRun) -> Outcome:
         self.steps.does("compute", self.steps.compute_error)
+        if self.steps.workers_lost:
+            self.steps.workers_lost -= 1
+            raise WorkerLostError("killed")
         assert run.bundle.is_dir()
         (run.folder / "found.txt").write_text("1")
         return self.steps.outcome
@@ -476,14 +480,43 @@ def test_end_of_the_service_leaves_what_waits_or_computes_to_the_next_start(tame
     assert STEPS["0"].done == ["capture", "captured", "compute", "kept"]
 
 
-def test_what_has_ended_the_service_twice_is_not_begun_a_third_time(tame: JobBench) -> None:
-    work = Steps()
+@pytest.mark.parametrize(("lost", "state"), [(2, JobState.SUCCEEDED), (3, JobState.FAILED)])
+def test_a_job_whose_worker_is_lost_is_computed_three_times_at_most(tame: JobBench, lost: int, state: JobState) -> None:
+    work = Steps(workers_lost=lost)
+    record = tame.done(work)
+    assert (record.state, work.done.count("compute")) == (state, 3)
+    assert failure_code(record) == (None if lost == 2 else "worker-lost")
+    assert tame.done(Steps()).state is JobState.SUCCEEDED
+
+
+def cut_off(tame: JobBench, work: Steps, *, attempts: int, takes: int = 1) -> UUID:
+    """A job that the service ended with, so often before the worker was over with it."""
     record = tame.manager.record(stepped(work))[0]
     (tame.folder.stage(record.id) / "bundle").mkdir()
-    for _ in range(2):
+    for _ in range(takes):
         tame.store.advance(record.id, JobState.COMPUTING)
+    for _ in range(attempts):
+        tame.store.begin_attempt(record.id)
+    return record.id
+
+
+def test_what_only_waited_for_the_worker_goes_on_before_what_may_have_ended_the_service(tame: JobBench) -> None:
+    works = [Steps(), Steps(), Steps()]
+    suspect, *waiting = (cut_off(tame, work, attempts=2 - 2 * bool(n), takes=3) for n, work in enumerate(works))
+    with capture_logs() as logs:
+        resume(tame.manager)
+    lined_up = [each["job"] for each in logs if each.get("found") == "taken up again"]
+    assert lined_up == [*map(str, waiting), str(suspect)]
+    assert [tame.manager.wait(each, WAIT_S).state for each in (*waiting, suspect)] == [JobState.SUCCEEDED] * 3
+
+
+@pytest.mark.parametrize(("attempts", "takes"), [(3, 3), (0, 10)])
+def test_what_has_ended_the_service_three_times_is_not_begun_again(tame: JobBench, attempts: int, takes: int) -> None:
+    work = Steps()
+    ended = cut_off(tame, work, attempts=attempts, takes=takes)
     resume(tame.manager)
-    assert tame.store.get(record.id).state is JobState.INTERRUPTED
+    record = tame.store.get(ended)
+    assert record.state is JobState.INTERRUPTED
     assert work.done == ["came to nothing"]
     assert list(tame.folder.incoming.iterdir()) == []
     assert {path.name for path in tame.folder.scan(record.id).iterdir()} == {"bundle", FILES}

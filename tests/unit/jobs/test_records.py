@@ -167,6 +167,24 @@ def test_progress_is_recorded_by_stage_by_hundredths_and_while_a_stage_goes_on(s
     ]
 
 
+def test_an_attempt_counts_once_the_worker_has_begun(store: JobStore) -> None:
+    scan = store.create({}, kind=JobKind.SCAN, rig="bench", label=None)
+    captured = ProgressRecorder(store, scan.id, hidden="secret/")
+    captured("capturing", 0.5, "")
+    for attempt in (1, 2):
+        computed = ProgressRecorder(store, scan.id, hidden="secret/", attempt=True)
+        for stage in ("waiting for the worker", "waiting for the pool"):
+            computed(stage, 0.0, "")
+        assert store.attempts(scan.id) == attempt - 1
+        for fraction in (0.0, 0.5):
+            computed("decode", fraction, "")
+        assert store.attempts(scan.id) == attempt
+    # Computed anew, it has all its attempts.
+    store.finish(scan.id, JobState.SUCCEEDED)
+    store.advance(scan.id, JobState.COMPUTING)
+    assert store.attempts(scan.id) == 0
+
+
 def spans(stages: Iterator[Stage]) -> list[tuple[str, float, float, str | None]]:
     return [(stage.name, (stage.begin - NOON).total_seconds(), stage.seconds, stage.inside) for stage in stages]
 

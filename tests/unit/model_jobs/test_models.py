@@ -186,6 +186,7 @@ def cut_off(bench: ModelBench, *, attempts: int, files: bool = False) -> UUID:
     model_id = bench.store.create(plan_json(plan), kind=JobKind.MODEL, rig="bench", label=None).id
     for _ in range(attempts):
         bench.store.advance(model_id, JobState.COMPUTING)
+        bench.store.begin_attempt(model_id)
     staged = bench.folder.stage(model_id)
     (staged / MODEL).write_bytes(b"half")
     if files:
@@ -196,9 +197,9 @@ def cut_off(bench: ModelBench, *, attempts: int, files: bool = False) -> UUID:
     return model_id
 
 
-def test_what_was_cut_off_is_made_once_more_and_no_file_is_lost(tmp_path: Path) -> None:
+def test_what_was_cut_off_is_made_again_and_no_file_is_lost(tmp_path: Path) -> None:
     killed = ModelBench(tmp_path, start=False)
-    queued, once, twice = (cut_off(killed, attempts=attempts) for attempts in range(3))
+    queued, once, thrice = (cut_off(killed, attempts=attempts) for attempts in (0, 1, 3))
     placed = cut_off(killed, attempts=1, files=True)
     gone, deleted = (cut_off(killed, attempts=1, files=True) for _ in range(2))
     for model_id in (gone, deleted):
@@ -210,7 +211,7 @@ def test_what_was_cut_off_is_made_once_more_and_no_file_is_lost(tmp_path: Path) 
     bench = ModelBench(tmp_path)
     assert bench.over(queued).state is bench.over(once).state is JobState.SUCCEEDED
     assert len(bench.tame.asked) == 2
-    ended = bench.over(twice)
+    ended = bench.over(thrice)
     assert (ended.state, ended.fault) == (JobState.INTERRUPTED, job_failure(interruption_error()))
     recovered = bench.over(placed)
     assert recovered.state is JobState.SUCCEEDED
