@@ -39,7 +39,7 @@ def test_sinusoids_measure_a_rendered_ball(
     patterns: tuple[Pattern, ...], method: str, rms_mm: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig_file = BUNDLES["ball with its truth"].rig_file(tmp_path)
-    monkeypatch.setattr(acquisition, "pattern_sequence", lambda _plan, size, *_, **__: encode(patterns, size))
+    monkeypatch.setattr(acquisition, "rig_sequence", lambda _plan, rig: encode(patterns, rig.projector.info.size))
     with open_rig(read_rig(rig_file)) as rig:
         acquisition.capture_frames(
             rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False
