@@ -111,9 +111,10 @@ class Rounds:
             (f"/calibration/{self.session}/solve", {}),
             ("/scan", {**turn, "exposure_s": 0.01}),
         ]
-        with suppress(httpx2.HTTPError):
+        # A client of its own: the other one is closed meanwhile.
+        with self._client() as http, suppress(httpx2.HTTPError):
             for path, body in requests:
-                answer = self.http.post(path, json=body)
+                answer = http.post(path, json=body)
                 # A solve is refused while a pose is read; a full line refuses, too.
                 assert answer.status_code in {202, 409, 422, 429, 503}, (path, answer.text)
                 if answer.status_code == 202 and not path.endswith("/solve"):
