@@ -25,7 +25,8 @@ from tests.e2e.conftest import KEY, ServiceProcess, Start
 from tests.e2e.faulty_rig.service import half_written
 from tests.e2e.test_calibration_walk import BOARD, RIG, SCENE
 
-pytestmark = pytest.mark.slow
+# A kill cuts connections that wait for an answer.
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")]
 KILLS = int(os.environ.get("SLRIG_FUZZ_KILLS") or 4)
 SEED = int(os.environ.get("SLRIG_FUZZ_SEED") or 45)
 SPAN_S = 9.0
@@ -176,4 +177,5 @@ def test_no_job_is_lost_at_any_instant(start: Start, tmp_path: Path, capsys: pyt
         rounds.settle(number, what)
         with capsys.disabled():
             print("." if number + 1 < KILLS else f" {KILLS} kills: {dict(rounds.ends)}", end="", flush=True)  # noqa: T201
+    rounds.http.close()
     assert sum(rounds.ends.values()) > 3 * KILLS
