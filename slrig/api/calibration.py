@@ -603,6 +603,7 @@ def fetch_pose_picture(
     if not service.folder.owns(path):
         message = f"{pose.name} of calibration {calibration_id} is {pose.state} and has no picture."
         raise ArtefactNotReadyError(message)
+    service.folder.require_whole(path.parent, path.name)
     return FileResponse(path, media_type="image/png", headers={"Cache-Control": "private, no-cache"})
 
 

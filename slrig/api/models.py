@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field, model_validator
 
 from slrig.api.files import KnownTag, file_answers, kept_file, refuse_absent, require_whole
 from slrig.api.problems import problems
-from slrig.api.schemas import JobBody, JobLinks, ShotRequest, filled, scan_plan
+from slrig.api.schemas import AskedPlan, JobBody, JobLinks, ShotRequest, filled, scan_plan
 from slrig.api.service import Cursor, IdempotencyKey, PageLength, Service, Serving, once, paged, started_once
 from slrig.bundle import MAX_VIEWS, AxisEntry, FreeText, PoseEntry, SafeText, Strict, orthonormalise_pose
 from slrig.calibrate.verification import require_healthy
@@ -108,7 +108,7 @@ class ModelRequest(MadeRequest):
 class ModelBody(JobBody):
     """A model on record. `plan` has the axis and the angles that it is made with."""
 
-    plan: ModelPlan
+    plan: AskedPlan[ModelPlan]
     pinned: bool = Field(description="kept, whatever the settings say of old models")
     links: JobLinks
 

@@ -17,6 +17,7 @@ from starlette.responses import StreamingResponse
 
 from slrig.api.calibration import BoardRequest, IfBusy
 from slrig.api.events import StreamPlace
+from slrig.api.files import require_whole
 from slrig.api.problems import file_of, problems
 from slrig.api.schemas import (
     MOST_EXPOSURE_S,
@@ -628,6 +629,7 @@ def find_planes(service: Serving, request: Annotated[PlanesRequest, Body()]) -> 
             f"Scan {request.scan} is {scan.state} and has no {MESH} here. Scan the empty turntable, and wait for it."
         )
         raise ScanStateError(message)
+    require_whole(service, scan, mesh.parent, MESH)
     found = service.worker.run(Task(turntable_planes, (mesh, service.turntable.axis()), what="planes of the turntable"))
     return _turntable(service.turntable.put_planes(found))
 

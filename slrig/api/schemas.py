@@ -297,6 +297,14 @@ FaultBody = Annotated[
 ]
 
 
+Plan = TypeVar("Plan")
+AskedPlan = Annotated[
+    Plan | None,
+    BeforeValidator(lambda plan: plan or None),
+    Field(description="what was asked; null where its record is damaged"),
+]
+
+
 class JobBody(BaseModel):
     """A job on record."""
 
@@ -316,7 +324,7 @@ class JobBody(BaseModel):
 class ScanBody(JobBody):
     """A scan on record."""
 
-    plan: ScanPlan
+    plan: AskedPlan[ScanPlan]
     pinned: bool = Field(description="kept, whatever the settings say of old scans")
     links: ScanLinks
 

@@ -344,7 +344,7 @@ def open_service(
     folder = DataFolder(settings.data_dir, group=settings.data_group)
     try:
         prepare_kernel_cache(folder.root / "cache")
-        database = Database(folder.database)
+        database = Database(folder.database, aside=folder.orphans)
         copies = None if settings.catalogue is None else Copies(database)
         outbox = Outbox(database, rig=rig.name, wanted=wanted_kinds(settings), copies=copies)
         worker = _worker(settings)

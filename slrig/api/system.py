@@ -66,6 +66,10 @@ class _Figures(Collector):
         for state in JobState:
             scans.add_metric([state], states[state])
         yield scans
+        damaged = GaugeMetricFamily("slrig_damaged_jobs", "Jobs whose record or files are damaged.", labels=["kind"])
+        for kind, count in self._service.store.damaged().items():
+            damaged.add_metric([kind], count)
+        yield damaged
         status = self._service.manager.status()
         is_open = status.facts is not None and status.fault is None
         yield GaugeMetricFamily("slrig_rig_open", "1 while the rig is open and well.", float(is_open))

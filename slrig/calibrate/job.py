@@ -60,6 +60,7 @@ from slrig.errors import (
 )
 from slrig.failure import JobFailure, disk_errors
 from slrig.jobs.data_folder import BUNDLE, DataFolder
+from slrig.jobs.database import or_none
 from slrig.jobs.job import Job, JobRun, Outcome, Recording
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import Holder, JobKind, utc_now
@@ -401,7 +402,7 @@ class Calibrations:
 
     register : the sessions on record. tolerance_mm : what the rig file says that a point of a scan may be wrong by.
 
-    Raises StorageError if the folder cannot be read, or the active calibration is gone.
+    Raises StorageError if the folder cannot be read.
     """
 
     def __init__(self, manager: JobManager, *, tolerance_mm: float | None = None) -> None:
@@ -710,9 +711,9 @@ class Calibrations:
 
     @property
     def active(self) -> UUID | None:
-        """The calibration in use; None where it is the rig's own."""
-        pointer = self.store.active()
-        return None if pointer is None else pointer.id
+        """The calibration in use; None where it is the rig's own, or not known."""
+        used = self._manager.rig.active
+        return None if used is None else or_none(UUID, used.name)
 
     def delete(self, session_id: UUID) -> None:
         """Remove a calibration with all its poses.
@@ -752,6 +753,8 @@ class Calibrations:
         """Return where a file of the last solve lies. Raises CalibrationNotFoundError, ArtefactNotReadyError."""
         record = self.register.get(session_id)
         path = self.store.solve(session_id, record.solve) / name
+        if record.solve:
+            self._manager.data.require_whole(path.parent, name)
         if not record.solve or not self._manager.data.owns(path):
             what = "was imported, and" if record.board is None else "has no solve yet that went well, and"
             message = f"Calibration {session_id} {what} has no {name}."

@@ -49,13 +49,14 @@ from slrig.errors import (
     CalibrationError,
     CalibrationNotFoundError,
     CalibrationStateError,
+    DamagedError,
     InvalidInputError,
     PoseRefusedError,
     SolveRefusedError,
     StorageError,
 )
 from slrig.failure import JobFailure, disk_errors
-from slrig.jobs.data_folder import BUNDLE, DataFolder
+from slrig.jobs.data_folder import BUNDLE, DataFolder, require_whole, write_entries
 from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, read_record, utc_now
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration, SequenceName, Size, SolveRecord
@@ -194,11 +195,14 @@ def setting_of(record: SessionRecord) -> Setting:
 
 def with_jobs(session: SessionRecord, jobs: Sequence[JobRecord]) -> SessionRecord:
     """A session as it is on disk, completed by what its jobs, oldest first, say."""
-    poses = tuple(sorted((pose_of(job) for job in jobs if job.kind is JobKind.POSE), key=lambda pose: pose.number))
+    # Without a plan, where its record is damaged.
+    of_poses = [job for job in jobs if job.kind is JobKind.POSE and job.plan]
+    poses = tuple(sorted(map(pose_of, of_poses), key=lambda pose: pose.number))
     solves = [job for job in jobs if job.kind is JobKind.SOLVE]
     running = [job for job in jobs if not job.state.final]
     state = SessionState.SOLVING if any(not job.state.final for job in solves) else session.state
-    fault = solves[-1].fault if solves and state is SessionState.FAILED else None
+    last = solves[-1].fault if solves else None
+    fault = last if last is not None and (state is SessionState.FAILED or last.code == DamagedError.code) else None
     progress = next((job.progress for job in running if job.state is not JobState.QUEUED), None)
     return replace(session, state=state, poses=poses, progress=progress, fault=fault, under_way=bool(running))
 
@@ -420,6 +424,8 @@ class CalibrationStore:
         place = self.solve(session_id, number)
         # A run that was cut off between this and its record may have left one.
         self._folder.remove(place)
+        with disk_errors(staged):
+            write_entries(staged)
         self._commit(staged, place)
 
     def discard(self, staged: Path) -> None:
@@ -427,11 +433,12 @@ class CalibrationStore:
         shutil.rmtree(staged, ignore_errors=True)
 
     def calibration(self, session_id: UUID, solve: int) -> Calibration:
-        """Return what a solve gave. Raises CalibrationError."""
+        """Return what a solve gave. Raises CalibrationError; DamagedError: it is not as it was written."""
         path = self.solve(session_id, solve) / CALIBRATION
         if path.is_symlink():
             message = f"{path} is a link, and what it leads to is not ours. Put the file itself there."
             raise CalibrationError(message)
+        self._folder.require_whole(path.parent, CALIBRATION)
         return read_calibration(path)
 
     def active(self) -> ActivePointer | None:
@@ -446,10 +453,7 @@ class CalibrationStore:
         except FileNotFoundError:
             return None
         except (ValueError, KeyError, TypeError) as error:
-            message = (
-                f"{path} does not say which calibration is active. Remove it to scan with the rig's own calibration, "
-                "then activate one again."
-            )
+            message = f"{path} does not say which calibration is active."
             raise StorageError(message) from error
 
     def activate(self, pointer: ActivePointer | None) -> None:
@@ -463,18 +467,21 @@ class CalibrationStore:
         write_file(self._pointer, (json.dumps(document) + "\n").encode())
 
     def active_calibration(self) -> ActiveCalibration | None:
-        """Return what is in use, read. Raises StorageError with what to do where that is gone."""
-        pointer = self.active()
-        if pointer is None:
-            return None
+        """Return what is in use, read; where it cannot be, with what to do."""
+        pointer = None
         try:
-            return ActiveCalibration(str(pointer.id), self.calibration(pointer.id, pointer.solve))
-        except CalibrationError as error:
-            message = (
-                f"The active calibration {pointer.id} cannot be read ({error}). Remove {self._pointer} to scan with "
-                "the rig's own calibration."
+            pointer = self.active()
+            return (
+                None
+                if pointer is None
+                else ActiveCalibration(str(pointer.id), self.calibration(pointer.id, pointer.solve))
             )
-            raise StorageError(message) from error
+        except (CalibrationError, StorageError, DamagedError) as error:
+            name = "unknown" if pointer is None else str(pointer.id)
+            remedy = f"Activate another one, or remove {self._pointer} and start again, for the rig's own calibration."
+            fault = f"The active calibration cannot be read: {error} {remedy}"
+            _log.error("the active calibration cannot be read", calibration=name, cause=str(error))
+            return ActiveCalibration(name, None, fault)
 
     @property
     def _pointer(self) -> Path:
@@ -495,7 +502,10 @@ def read_session(folder: Path) -> SessionRecord:
 
 def session_readings(folder: Path) -> list[ReadPose]:
     """What was read of the accepted poses of a session, by their numbers. Raises StorageError: it cannot be read."""
-    return [_read_reading(_pose_place(folder, job) / READING) for job in _poses_on_disk(folder) if job.fault is None]
+    found = [_pose_place(folder, job) for job in _poses_on_disk(folder) if job.fault is None]
+    for place in found:
+        require_whole(place, READING, remedy="Drop that pose (DELETE …/pose/N) and shoot it again.")
+    return [_read_reading(place / READING) for place in found]
 
 
 def with_poses_on_disk(session: SessionRecord, folder: Path) -> SessionRecord:

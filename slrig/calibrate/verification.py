@@ -34,7 +34,7 @@ from slrig.calibration.health import (
 )
 from slrig.errors import CalibrationStateError, PoseRefusedError, UnsupportedByDeviceError
 from slrig.jobs.data_folder import DataFolder
-from slrig.jobs.database import Database, VerificationRow
+from slrig.jobs.database import Database, VerificationRow, readable
 from slrig.jobs.job import Job, JobRun, Outcome, Recording
 from slrig.jobs.records import Clock, JobKind, utc_now
 from slrig.model import Calibration
@@ -245,7 +245,8 @@ class HealthStore:
         if since is not None:
             query = query.where(VerificationRow.at >= _stamp(since))
         with self.database.reading() as session:
-            return [_record(row) for row in session.scalars(query.order_by(VerificationRow.number.desc()).limit(limit))]
+            rows = session.scalars(query.order_by(VerificationRow.number.desc()).limit(limit))
+            return list(readable(rows, _record))
 
     def latest(self) -> VerificationRecord | None:
         """The newest verification; None where there is none."""
@@ -256,7 +257,7 @@ class HealthStore:
         query = select(VerificationRow).where(VerificationRow.calibration == calibration)
         with self.database.reading() as session:
             rows = session.scalars(query.order_by(VerificationRow.number.desc()).limit(limit))
-            return [_record(row) for row in rows][::-1]
+            return [*readable(rows, _record)][::-1]
 
     def health_of(self, calibration: str) -> Health:
         """What the last verification of a calibration came to; unknown where there was none."""

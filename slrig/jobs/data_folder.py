@@ -11,7 +11,7 @@ DATA/presets/NAME.json  presets that were put: see `slrig.scan.plan`
 DATA/clock.json      the time that ages are reckoned by: see `slrig.jobs.retention`
 DATA/doctor.json     what `slrig doctor` found last, and conform.json: see `slrig.doctor.job`
 DATA/.incoming/ID/   a scan, a pose, a solve or a model being made; swept at the next start
-DATA/.orphans/ID/    files found at start that no record knows; kept, because they may be somebody's work
+DATA/.orphans/ID/    files found at start that no record knows, a damaged database; kept: they may be somebody's work
 DATA/cache/          compiled kernels, where the package's own folder cannot be written
 """
 
@@ -33,6 +33,7 @@ from pydantic import TypeAdapter, ValidationError
 from slrig.bundle import sync_folder, sync_tree, write_file
 from slrig.errors import DamagedError, DataFolderGoneError, StorageError
 from slrig.failure import disk_errors
+from slrig.jobs.records import read_record
 
 DATABASE, SCANS, ORPHANS, BUNDLE = "slrig.sqlite", "scans", ".orphans", "bundle"
 
@@ -74,13 +75,14 @@ def file_entry(path: Path) -> FileEntry:
 
 
 def read_entries(folder: Path) -> Mapping[str, FileEntry]:
-    """What `FILES` says of a folder: none where there is no such file; where it cannot be read, an impossible entry of
-    itself, so that no damage keeps a service from its start.
+    """What `FILES` says of a folder: none where an earlier version of slrig finished the job; where it is gone or
+    cannot be read, an impossible entry of itself, so that no damage keeps a service from its start.
     """
     try:
         return _entries_adapter.validate_json((folder / FILES).read_bytes())
     except FileNotFoundError:
-        return {}
+        kept = read_record(folder)
+        return {} if kept is None or not kept.has_files_json else {FILES: FileEntry("", -1)}
     except (ValidationError, OSError):
         return {FILES: FileEntry("", -1)}
 
@@ -93,7 +95,7 @@ def damaged_files(folder: Path, *, digests: bool, names: Iterable[str] | None = 
     """
     entries = read_entries(folder)
     if FILES in entries:
-        return {FILES: "cannot be read"}
+        return {FILES: "cannot be read" if (folder / FILES).exists() else "is gone"}
     found = {}
     for name in entries if names is None else entries.keys() & set(names):
         path, entry = folder / name, entries[name]
@@ -123,6 +125,12 @@ def check_files(root: Path) -> Iterator[tuple[str, str | None]]:
             continue
         for name in sorted({*names, *found}):
             yield (place / name).as_posix(), found.get(name)
+
+
+def require_whole(place: Path, *names: str, remedy: str) -> None:
+    """Raise DamagedError unless files of a finished job are as they were committed; without names, all of them."""
+    if found := damaged_files(place, digests=True, names=names or None):
+        raise damage(f"Files of {place.name} are damaged", found, remedy)
 
 
 def damage(what: str, found: Mapping[str, str], remedy: str) -> DamagedError:
@@ -348,9 +356,8 @@ class DataFolder:
                 found = (place / name).stat()
                 looked[place / name] = (found.st_ino, found.st_size, found.st_mtime_ns)
         unknown = [each for each in names if self._whole.get(place / each) != looked.get(place / each, ())]
-        found_damage = damaged_files(place, digests=True, names=unknown) if unknown else {}
-        if found_damage:
-            raise damage(f"Files of {place.name} are damaged", found_damage, "They are not given out.")
+        if unknown:
+            require_whole(place, *unknown, remedy="They are not given out.")
         self._whole.update(looked)
 
     def remove(self, place: Path) -> None:

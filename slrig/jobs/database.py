@@ -1,22 +1,28 @@
-"""The service's SQLite database and its tables: write-ahead log, synchronous FULL, so answers survive power cuts."""
+"""The service's SQLite database and its tables: write-ahead log, synchronous FULL, so answers survive power cuts.
+
+A row that cannot be read is no error of those beside it; a damaged file is put aside, and what can be read of it is
+taken over.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import platform
 import random
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from datetime import datetime
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
-from uuid import UUID
+from typing import Any, TypeVar
+from uuid import UUID, uuid4
 
+import structlog
 from alembic import command
 from alembic.config import Config
 from alembic.migration import MigrationContext
@@ -35,13 +41,14 @@ from sqlalchemy import (
     UniqueConstraint,
     create_engine,
     event,
+    inspect,
 )
 from sqlalchemy.engine.interfaces import DBAPIConnection, DBAPICursor
 from sqlalchemy.exc import DatabaseError, OperationalError
 from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column
 
-from slrig.errors import StorageError
-from slrig.failure import JobFailure
+from slrig.errors import DamagedError, InvalidInputError, StorageError
+from slrig.failure import JobFailure, disk_errors
 from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState
 
 
@@ -228,8 +235,73 @@ class VerificationRow(Base):
     )
 
 
+_log = structlog.get_logger(__name__)
+
+_Row = TypeVar("_Row", bound=Base)
+_Read = TypeVar("_Read")
+
+UNREADABLE = JobFailure(
+    DamagedError.code,
+    "The record of this job is damaged, and cannot be read. Look after the disk. Where its files are whole, the next "
+    "start of the service makes the record anew of them; if not, delete the job.",
+)
+"""The fault of a job whose row cannot be read."""
+
+
+class _UnreadableJson(dict[str, Any]):
+    """Stands for a text in a column of JSON that is none."""
+
+
+def _from_json(text: str | bytes) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return _UnreadableJson()
+
+
+def readable(rows: Iterable[_Row], read: Callable[[_Row], _Read]) -> Iterator[_Read]:
+    """What rows are, without those that `read` cannot read: the log has these."""
+    for row in rows:
+        try:
+            yield read(row)
+        except (ValueError, TypeError, KeyError, AttributeError, InvalidInputError) as error:
+            _log.error(
+                "a damaged record is left out", table=row.__tablename__, row=inspect(row).identity, cause=str(error)
+            )
+
+
 def record_of(row: JobRow) -> JobRecord:
-    """A row as the record that it is."""
+    """A row as the record that it is; one that cannot be read as a job that failed by `UNREADABLE`, and that no
+    retention removes.
+    """
+    try:
+        return _readable_record(row)
+    except (ValueError, TypeError):
+        label = row.label if isinstance(row.label, str) else None
+        return JobRecord(
+            number=row.number,
+            id=or_none(UUID, row.id) or UUID(int=row.number),
+            kind=JobKind(row.kind),
+            state=JobState.FAILED,
+            label=label,
+            rig=str(row.rig),
+            plan={},
+            created_at=or_none(datetime.fromisoformat, row.created_at) or datetime.fromtimestamp(0, UTC),
+            started_at=or_none(datetime.fromisoformat, row.started_at),
+            finished_at=or_none(datetime.fromisoformat, row.finished_at),
+            progress=JobProgress("", 0.0, ""),
+            fault=UNREADABLE,
+            summary=None,
+            pinned=True,
+            parent=or_none(UUID, row.parent),
+        )
+
+
+def _readable_record(row: JobRow) -> JobRecord:
+    for document in (row.plan, row.summary or {}):
+        if isinstance(document, _UnreadableJson) or not isinstance(document, dict):
+            message = "a plan or a summary that is no JSON object"
+            raise TypeError(message)
     return JobRecord(
         number=row.number,
         id=UUID(row.id),
@@ -241,13 +313,21 @@ def record_of(row: JobRow) -> JobRecord:
         created_at=datetime.fromisoformat(row.created_at),
         started_at=_moment(row.started_at),
         finished_at=_moment(row.finished_at),
-        progress=JobProgress(row.stage, row.fraction, row.detail),
+        progress=JobProgress(row.stage, float(row.fraction), row.detail),
         fault=None if row.failure_code is None else JobFailure(row.failure_code, row.failure_message or ""),
         summary=row.summary,
         pinned=row.pinned,
         parent=None if row.parent is None else UUID(row.parent),
         requested_by=row.requested_by,
     )
+
+
+def or_none(read: Callable[[str], _Read], text: str | None) -> _Read | None:
+    """What a text says; None where it cannot be read."""
+    try:
+        return None if text is None else read(text)
+    except (ValueError, TypeError, AttributeError):
+        return None
 
 
 def _moment(stamp: str | None) -> datetime | None:
@@ -270,15 +350,20 @@ class Database:
     A change holds the file's one write lock from its first statement on: what it reads is what it changes, whatever
     another thread or process does meanwhile.
 
+    aside : where a damaged file is moved; a new one takes its place, with what could be read of it.
+
     Raises
     ------
     StorageError
         The disk refuses: here, and wherever it is read or changed. Or another version of slrig wrote the file.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, aside: Path | None = None) -> None:
         self.path = path
         self._writing = threading.Lock()
+        found = _damage_of(path)
+        if found is not None:
+            damaged = _put_aside(path, (aside or path.parent) / f"{path.name}-damaged-{uuid4().hex[:8]}")
         self._engine = sqlite_engine(path)
         with self._refusals(), writing(self._engine, PATIENCE_S).begin() as connection:
             if unknown := upgrade(connection, "slrig.jobs:migrations/versions", Base.metadata):
@@ -289,6 +374,13 @@ class Database:
                     "--data."
                 )
                 raise StorageError(message)
+        if found is not None:
+            rows = _salvage(damaged, path)
+            _log.error(
+                "the records were damaged; what could be read of them is taken over, and finished jobs come back by "
+                "their files: look after the disk, and make schedules anew that are gone",
+                cause=found, moved_to=str(damaged), rows=rows,
+            )  # fmt: skip
 
     def close(self) -> None:
         """Let the file go. Idempotent."""
@@ -331,9 +423,66 @@ class Database:
             raise StorageError(message) from error
 
 
+_DAMAGES = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+
+
+def _damage_of(path: Path) -> str | None:
+    """What makes a file useless as the database; None where it is sound, or not there."""
+    if not path.is_file():
+        return "it is a folder" if path.is_dir() else None
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True, timeout=PATIENCE_S)) as file:
+            return next((text for (text,) in file.execute("PRAGMA quick_check(1)") if text != "ok"), None)
+    except sqlite3.DatabaseError as error:
+        # Others, as of a disk that refuses or a file that is locked, are told by who opens it next.
+        return str(error) if (getattr(error, "sqlite_errorcode", 0) & 0xFF) in _DAMAGES else None
+
+
+def _put_aside(path: Path, to: Path) -> Path:
+    """Move the database with its log, and return where it is. Raises StorageError."""
+    with disk_errors(path):
+        to.parent.mkdir(exist_ok=True)
+        for suffix in ("", "-wal", "-shm"):
+            if (log := path.with_name(path.name + suffix)).exists():
+                log.rename(to.with_name(to.name + suffix))
+    return to
+
+
+def _salvage(damaged: Path, path: Path) -> int:
+    """Take over the rows of a damaged file that can be read, from both ends of each table; return how many."""
+    if not damaged.is_file():
+        return 0
+    with (
+        closing(sqlite3.connect(f"{damaged.as_uri()}?mode=rw", uri=True, timeout=PATIENCE_S)) as source,
+        closing(sqlite3.connect(path, timeout=PATIENCE_S)) as new,
+    ):
+        source.text_factory = _text
+        # So that SQLite opens a file that was cut.
+        source.execute("PRAGMA writable_schema=ON")
+        for table in Base.metadata.sorted_tables:
+            names = ", ".join(column.name for column in table.columns)
+            values = ", ".join("?" for _ in table.columns)
+            for order in ("ASC", "DESC"):
+                try:
+                    for row in source.execute(f"SELECT {names} FROM {table.name} ORDER BY rowid {order}"):  # noqa: S608
+                        new.execute(f"INSERT OR IGNORE INTO {table.name} ({names}) VALUES ({values})", row)  # noqa: S608
+                except sqlite3.DatabaseError:
+                    continue
+                break
+        taken = new.total_changes
+        new.execute("DELETE FROM event WHERE job_id NOT IN (SELECT id FROM job)")
+        new.execute("DELETE FROM run WHERE schedule_id NOT IN (SELECT id FROM schedule)")
+        new.commit()
+        return taken
+
+
+def _text(found: bytes) -> str:
+    return found.decode("utf-8", errors="replace")
+
+
 def sqlite_engine(path: Path) -> Engine:
     """A SQLite file with a write-ahead log; what was committed survives a power cut."""
-    engine = create_engine(f"sqlite:///{path}")
+    engine = create_engine(f"sqlite:///{path}", json_deserializer=_from_json)
     event.listen(engine, "connect", _set_up)
     event.listen(engine, "begin", _begin)
     return engine
@@ -350,6 +499,7 @@ def writing(engine: Engine, patience_s: float, synchronous: str = "FULL") -> Eng
 def _set_up(connection: DBAPIConnection, _record: object) -> None:
     # The driver begins no transactions of its own: `_begin` does.
     connection.isolation_level = None
+    connection.text_factory = _text
     cursor = connection.cursor()
     for pragma in (f"busy_timeout={int(1000 * PATIENCE_S)}", "synchronous=FULL", "foreign_keys=ON"):
         cursor.execute(f"PRAGMA {pragma}")

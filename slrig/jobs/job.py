@@ -17,9 +17,10 @@ import structlog
 from pydantic import TypeAdapter
 
 from slrig.capture import EvidenceSummary
-from slrig.errors import ScanCancelledError, StorageError
+from slrig.errors import DamagedError, ScanCancelledError, StorageError
 from slrig.failure import JobFailure
 from slrig.jobs.data_folder import BUNDLE, RESULT, DataFolder
+from slrig.jobs.database import UNREADABLE
 from slrig.jobs.records import JobKind, JobProgress, JobRecord
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration, CaptureHeader, Region, Shot
@@ -331,10 +332,25 @@ class Job:
 
     @classmethod
     def from_record(cls, record: JobRecord) -> Self:
-        """The job that is on record."""
+        """The job that is on record. Raises DamagedError, ValueError: its plan cannot be read."""
+        if record.fault == UNREADABLE:
+            raise DamagedError(UNREADABLE.message)
+        return cls.from_plan(record)
+
+    @classmethod
+    def from_plan(cls, record: JobRecord) -> Self:
+        """The job of a record that can be read. Raises ValueError: another version of slrig made the plan."""
         group = {} if record.parent is None else {"group": record.parent}
         job: Self = _adapter(cls).validate_python({**record.plan, **group})
         return job
+
+    @classmethod
+    def place_of(cls, record: JobRecord, data: DataFolder) -> Path | None:
+        """Where the files of the job on record lie; of one whose plan cannot be read, what has its id for a name."""
+        try:
+            return cls.from_record(record).place(data, record.id)
+        except (DamagedError, ValueError):
+            return next((place for place in cls.places(data) if place.name == str(record.id)), None)
 
     def check(self, rig: RigSession) -> int:  # noqa: ARG002 - for those that use it
         """Raise what the rig cannot do of this, as far as it is known; return the bytes that are needed on the disk."""

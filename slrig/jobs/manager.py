@@ -368,7 +368,7 @@ class JobManager:
                 "delete it."
             )
             raise ScanStateError(message)
-        place = self.kinds[record.kind].from_record(record).place(self.data, job_id)
+        place = self.kinds[record.kind].place_of(record, self.data)
         with unused or nullcontext():
             self.data.discard(job_id)
             if place is not None:

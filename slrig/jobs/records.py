@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from itertools import pairwise
@@ -128,7 +128,8 @@ class JobRecord:
 
     parent : the calibration of a pose or a solve, the acceptance test of a position. summary : what came of it, as far
     as a list shows it; None before. pinned : no retention removes it.
-    requested_by : the name of the key, or the schedule, that asked for it, where that is known.
+    requested_by : the name of the key, or the schedule, that asked for it, where that is known. has_files_json : beside
+    its files, whether `files.json` was written with it.
     """
 
     number: int
@@ -147,6 +148,7 @@ class JobRecord:
     pinned: bool = False
     parent: UUID | None = None
     requested_by: str | None = None
+    has_files_json: bool = False
 
 
 _record_adapter = TypeAdapter(JobRecord)
@@ -154,7 +156,7 @@ _record_adapter = TypeAdapter(JobRecord)
 
 def write_record(folder: Path, record: JobRecord) -> None:
     """Write the record of a finished job into its folder, for a database that was lost. Raises StorageError."""
-    write_file(folder / RECORD, _record_adapter.dump_json(record, indent=1))
+    write_file(folder / RECORD, _record_adapter.dump_json(replace(record, has_files_json=True), indent=1))
 
 
 def read_record(folder: Path) -> JobRecord | None:
@@ -215,7 +217,8 @@ def reference(job: JobRecord) -> dict[str, Any]:
         named[name], links[name] = str(job.parent), f"{room}/{job.parent}"
         if job.kind is not JobKind.SCAN:
             place = links[name]
-            links["self"] = f"{place}/pose/{job.plan['number']}" if job.kind is JobKind.POSE else place
+            number = job.plan.get("number") if job.kind is JobKind.POSE else None
+            links["self"] = place if number is None else f"{place}/pose/{number}"
             links["events"] = f"{place}/events"
     if job.kind is JobKind.POSITION:
         del links["events"]

@@ -7,9 +7,9 @@ from uuid import UUID
 
 import structlog
 
-from slrig.errors import StorageError
 from slrig.failure import interruption_error, job_failure
 from slrig.jobs.data_folder import BUNDLE, damage, damaged_files, missing_files, remove
+from slrig.jobs.database import or_none
 from slrig.jobs.job import Job, Outcome
 from slrig.jobs.manager import MAX_ATTEMPTS, JobManager
 from slrig.jobs.records import JobRecord, JobState, acting_as, read_record
@@ -29,10 +29,11 @@ def resume(manager: JobManager) -> None:
     - Any other was interrupted; its frames are kept if it keeps them and all had come.
     - A deletion that was cut off is completed.
     - A job that succeeded and lacks files is recorded as failed.
-    - Files of a finished job without a record, as after a lost database, are on record again, as they say
-      themselves; other files without a record are put aside in `.orphans`.
+    - Files of a finished job without a record that can be read, as after a lost database, are on record again, as they
+      say themselves; other files without a record are put aside in `.orphans`.
     """
     store, data = manager.store, manager.data
+    unreadable = {record.id for record in store.unreadable()}
     going_on = set()
     # What may have ended the service is the last in line.
     for record in sorted(store.unfinished(), key=lambda each: store.attempts(each.id)):
@@ -53,7 +54,7 @@ def resume(manager: JobManager) -> None:
         if leftover.name not in going_on:
             remove(leftover)
     for kind in manager.kinds.values():
-        _restore(manager, kind)
+        _restore(manager, kind, unreadable)
 
 
 def _went_on(manager: JobManager, record: JobRecord, job: Job) -> bool:
@@ -100,30 +101,35 @@ def _require_files(manager: JobManager, record: JobRecord) -> None:
     if place is None:
         return
     missing = missing_files(place, job.promises)
-    if not missing:
-        found = damaged_files(place, digests=False)
-        if found:
-            store.lose_files(record.id, job_failure(damage(f"Files of this {job.noun} are damaged", found, job.remedy)))
-            _note(record, "damaged")
-        return
-    if data.owns(data.staging(record.id)):
+    if missing and data.owns(data.staging(record.id)):
         store.delete(record.id)
         return
-    message = f"{' and '.join(missing)} of this {job.noun} is gone from {place}. Start it again."
-    store.lose_files(record.id, job_failure(StorageError(message)))
-    _note(record, "without files")
+    found = {**damaged_files(place, digests=False), **dict.fromkeys(missing, "is gone")}
+    if found:
+        anew = job.movable and data.owns(place / BUNDLE)
+        remedy = f"POST {record.kind.path}/{record.id}/reconstruct makes them anew." if anew else job.remedy
+        store.lose_files(
+            record.id, job_failure(damage(f"Files in {place.relative_to(data.root)} are damaged", found, remedy))
+        )
+        _note(record, "damaged")
 
 
-def _restore(manager: JobManager, kind: type[Job]) -> None:
-    """Put finished jobs on record again, in the order of their making, and other files aside."""
+def _restore(manager: JobManager, kind: type[Job], unreadable: set[UUID]) -> None:
+    """Put finished jobs on record again, in the order of their making, and other files aside.
+
+    unreadable : jobs whose records make room.
+    """
     store, data = manager.store, manager.data
     known, found = set(store.states(kind.kind)), list[tuple[JobRecord, Path]]()
     for place in kind.places(data):
         kept = None if place.is_symlink() else read_record(place)
-        job_id = kept.id if kept is not None else _id_of(place)
-        if job_id in known and (kept is None or _belongs(manager, kept, place)):
+        job_id = kept.id if kept is not None else or_none(UUID, place.name)
+        belongs = kept is not None and _belongs(manager, kept, place)
+        if job_id in known and (kept is None or (belongs and job_id not in unreadable)):
             continue
-        if kept is not None and _belongs(manager, kept, place) and not missing_files(place, kind.promises):
+        if kept is not None and belongs:
+            if kept.id in unreadable:
+                store.delete(kept.id)
             found.append((kept, place))
         else:
             data.put_aside(place)
@@ -142,13 +148,6 @@ def _belongs(manager: JobManager, kept: JobRecord, place: Path) -> bool:
         return manager.kinds[kept.kind].from_record(kept).place(manager.data, kept.id) == place
     except (KeyError, ValueError):
         return False
-
-
-def _id_of(place: Path) -> UUID | None:
-    try:
-        return UUID(place.name)
-    except ValueError:
-        return None
 
 
 def _note(record: JobRecord, found: str) -> None:

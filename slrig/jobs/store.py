@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from itertools import islice
 from typing import Any
 from uuid import UUID, uuid4
 
@@ -16,9 +17,21 @@ from sqlalchemy import ColumnElement, Select, delete, event, func, select, text
 from sqlalchemy.orm import Session
 
 from slrig.config import NoticeKind
-from slrig.errors import IdempotencyError, JobNotFoundError, KeyInFlightError
+from slrig.errors import DamagedError, IdempotencyError, JobNotFoundError, KeyInFlightError
 from slrig.failure import JobFailure
-from slrig.jobs.database import AuditRow, CopyRow, Database, EventRow, JobRow, KeyRow, NoticeRow, record_of
+from slrig.jobs.database import (
+    UNREADABLE,
+    AuditRow,
+    CopyRow,
+    Database,
+    EventRow,
+    JobRow,
+    KeyRow,
+    NoticeRow,
+    or_none,
+    readable,
+    record_of,
+)
 from slrig.jobs.records import (
     RIG_JOBS,
     Clock,
@@ -350,8 +363,9 @@ class JobStore:
         query = _jobs(*kinds).where(JobRow.parent.is_not(None)).order_by(JobRow.number)
         found: dict[UUID, list[JobRecord]] = defaultdict(list)
         with self.database.reading() as session:
-            for row in session.scalars(query):
-                found[UUID(row.parent)].append(record_of(row))
+            for record in map(record_of, session.scalars(query)):
+                if record.parent is not None:
+                    found[record.parent].append(record)
         return found
 
     def replan(self, job_id: UUID, plan: Mapping[str, Any]) -> JobRecord:
@@ -373,7 +387,7 @@ class JobStore:
 
     def takes(self, job_id: UUID) -> int:
         """How often a job was lined up to be computed, whether the worker came to it or not."""
-        states = [event.data["state"] for event in self.events(job_id, after=0) if event.kind == "state"]
+        states = [event.data.get("state") for event in self.events(job_id, after=0) if event.kind == "state"]
         return states.count(JobState.COMPUTING)
 
     def pin(self, job_id: UUID, *kinds: JobKind, pinned: bool) -> JobRecord:
@@ -387,7 +401,25 @@ class JobStore:
         """Return the state of every job on record."""
         with self.database.reading() as session:
             query = select(JobRow.id, JobRow.state).where(JobRow.kind.in_(kinds or JobKind))
-            return {UUID(found): JobState(state) for found, state in session.execute(query)}
+            rows = [(or_none(UUID, found), or_none(JobState, state)) for found, state in session.execute(query)]
+        return {found: state or JobState.FAILED for found, state in rows if found is not None}
+
+    def unreadable(self) -> Sequence[JobRecord]:
+        """The jobs whose rows cannot be read; they are in a final state from now on. One without an id is forgotten."""
+        with self.database.changing() as session:
+            rows = [row for row in session.scalars(_jobs()) if record_of(row).fault == UNREADABLE]
+            for row in rows:
+                _log.error("the record of a job is damaged", number=row.number, job=row.id, kind=row.kind)
+                if or_none(UUID, row.id) is None:
+                    session.delete(row)
+                row.state, row.failure_code, row.failure_message = JobState.FAILED, UNREADABLE.code, UNREADABLE.message
+            return [record_of(row) for row in rows]
+
+    def damaged(self) -> Mapping[JobKind, int]:
+        """How many jobs of each kind are damaged: their record or their files."""
+        query = select(JobRow.kind, func.count()).where(JobRow.failure_code == DamagedError.code).group_by(JobRow.kind)
+        with self.database.reading() as session:
+            return {JobKind(kind): count for kind, count in session.execute(query) if kind in set(JobKind)}
 
     def advance(self, job_id: UUID, state: JobState) -> datetime:
         """Record that a running job entered another running state, and return when."""
@@ -575,7 +607,7 @@ class JobStore:
             wake()
 
     def _wake(self, job_id: UUID, parent: str | None) -> None:
-        self.wake(EVERY_JOB, job_id, None if parent is None else UUID(parent))
+        self.wake(EVERY_JOB, job_id, or_none(UUID, parent))
 
 
 def _jobs(*kinds: JobKind) -> Select[JobRow]:
@@ -709,20 +741,13 @@ class Audit:
 
     def page(self, *, before: int | None, limit: int) -> Sequence[AuditEntry]:
         """Up to `limit` entries, newest first, whose number is below `before`."""
-        query = select(AuditRow).order_by(AuditRow.number.desc()).limit(limit)
+        query = select(AuditRow).order_by(AuditRow.number.desc()).execution_options(yield_per=limit)
         if before is not None:
             query = query.where(AuditRow.number < before)
         with self._database.reading() as session:
-            return [
-                AuditEntry(
-                    row.number,
-                    datetime.fromisoformat(row.at),
-                    row.who,
-                    row.address,
-                    row.method,
-                    row.path,
-                    row.status,
-                    row.made,
-                )
-                for row in session.scalars(query)
-            ]
+            return list(islice(readable(session.scalars(query), _audit_entry), limit))
+
+
+def _audit_entry(row: AuditRow) -> AuditEntry:
+    at = datetime.fromisoformat(row.at)
+    return AuditEntry(row.number, at, row.who, row.address, row.method, row.path, row.status, row.made)

@@ -28,7 +28,7 @@ from slrig.errors import (
     ViewsFailedError,
 )
 from slrig.failure import errors_by_code, job_failure
-from slrig.jobs.data_folder import BUNDLE, SCANS, DataFolder
+from slrig.jobs.data_folder import BUNDLE, SCANS, DataFolder, require_whole
 from slrig.jobs.job import Job, JobRun, Outcome
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, acting_as, utc_now
@@ -129,7 +129,7 @@ class ModelJob(Job):
         return plan_json(self.plan)
 
     @classmethod
-    def from_record(cls, record: JobRecord) -> Self:
+    def from_plan(cls, record: JobRecord) -> Self:
         """See `Job`."""
         return cls(plan_from_json(record.plan))
 
@@ -144,6 +144,7 @@ class ModelJob(Job):
         for scan, mesh in meshes.items():
             if not mesh.exists() or mesh.resolve() != (data / SCANS).resolve() / scan / MESH:
                 raise _mesh_gone(mesh, scan)
+            require_whole(mesh.parent, MESH, remedy=f"POST /scan/{scan}/reconstruct makes it anew.")
         combining.combine_into(
             meshes,
             run.folder,
@@ -304,7 +305,7 @@ class Models:
         """
         with self._naming:
             for record in self.jobs.unfinished(JobKind.MODEL):
-                if str(scan_id) in record.plan["scans"] or self.jobs.get(scan_id).parent == record.id:
+                if str(scan_id) in record.plan.get("scans", ()) or self.jobs.get(scan_id).parent == record.id:
                     message = (
                         f"Scan {scan_id} is needed by model {record.id}, which is {record.state}. Wait for it, or "
                         f"cancel it first (POST /model/{record.id}/cancel)."

@@ -52,7 +52,7 @@ export function Mesh({scan, other, report, again}) {
   const ranges = {sigma: sigma ? [sigma.p5, sigma.p95].map((mm) => mm / SIGMA_STEP_MM) : [0, 1], stripe: [0, report?.frames.projector_px[axis] ?? 1]};
   const range = ranges[mode] ?? [0, 1];
   useEffect(() => view?.set(mode, range[1] > range[0] ? range : [range[0], range[0] + 1], shown), [view, mode, ...range, ...shown]);
-  useEffect(() => view?.limit(scan.plan.reconstruction?.region?.box_mm), [view, scan.id]);
+  useEffect(() => view?.limit(scan.plan?.reconstruction?.region?.box_mm), [view, scan.id]);
   const take = (x, y) => {
     const hit = view.pick(x, y);
     if (hit) setPoints((before) => [...before, hit]);

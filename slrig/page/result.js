@@ -82,11 +82,13 @@ function Ended({scan, may}) {
     sessionStorage.setItem("asked", made.id);
     location.hash = "#/scan";
   });
+  const [anew, making, refused] = useAction(() => ask("POST", `/scan/${scan.id}/reconstruct`));
   return html`<${Refusal} problem=${{document: {title: titles[scan.state] ?? "There is no mesh"}, message: scan.error?.detail ?? "It gave no mesh."}}>
       ${scan.links.files["bundle.zip"] && html`<p>Its frames are kept: the bundle can be downloaded, to reconstruct it elsewhere or to ask for help.</p>`}
     <//>
-    ${may("scan") && html`<${Action} kind="primary" busy=${busy} onClick=${repeat}>Scan again<//>`}
-    <${Refusal} problem=${problem} />`;
+    ${may("scan") && scan.links.files["bundle.zip"] && html`<${Action} busy=${making} onClick=${anew}>Reconstruct again<//>`}
+    ${may("scan") && scan.plan && html`<${Action} kind="primary" busy=${busy} onClick=${repeat}>Scan again<//>`}
+    <${Refusal} problem=${problem ?? refused} />`;
 }
 
 /** What the report says that a person should know, warnings first. */
@@ -104,7 +106,7 @@ function Figures({scan, report}) {
       ...figures(scan).map(([name, value, written]) => [name, value === undefined ? null : written(value)]),
       ["σ holds", summary.mesh.sigma_holds],
       ["Patterns", summary.identity],
-      ["Limited to", limits(scan.plan.reconstruction?.region)],
+      ["Limited to", limits(scan.plan?.reconstruction?.region)],
       ["Calibration", calibration && (calibration.solved_at ? `${age === null ? "age not known" : `${Number(age.toPrecision(2))} days old`}` : calibration.absent)],
       ["Its expected error", calibration?.expected_error_mm && length(calibration.expected_error_mm)],
       ["Against the known truth, rms within 1 mm", summary.truth && length(summary.truth.rms_mm)],

@@ -153,10 +153,13 @@ class RigFacts:
 
 @dataclass(frozen=True, slots=True)
 class ActiveCalibration:
-    """A calibration that takes the place of the rig's own. name : the id that it is on record by."""
+    """A calibration that takes the place of the rig's own. name : the id that it is on record by. calibration : None
+    where its files are damaged, as `fault` says; no scan is taken then, with the rig's own neither.
+    """
 
     name: str
-    calibration: Calibration
+    calibration: Calibration | None
+    fault: str = ""
 
 
 @contextmanager
@@ -235,6 +238,8 @@ class RigSession:
 
     def misfit(self, active: ActiveCalibration) -> CalibrationError | None:
         """Why a calibration cannot be used with the devices of this rig; None if it can, or before it was open."""
+        if active.calibration is None:
+            return CalibrationError(active.fault)
         if self.facts is None:
             return None
         try:
@@ -254,7 +259,7 @@ class RigSession:
             It is for other devices than those of the open rig.
         """
         # Before the rig is open its devices are unknown; a scan is then refused with the same words.
-        fault = None if active is None else self.misfit(active)
+        fault = None if active is None or active.calibration is None else self.misfit(active)
         if fault is not None:
             raise fault
         self.active = active

@@ -111,7 +111,7 @@ class ScanJob(Job):
         return plan_json(self.plan)
 
     @classmethod
-    def from_record(cls, record: JobRecord) -> Self:
+    def from_plan(cls, record: JobRecord) -> Self:
         """See `Job`."""
         return cls(plan_from_json(record.plan))
 

@@ -24,7 +24,7 @@ from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
 from slrig.errors import ScanStateError, ScheduleError, ScheduleNotFoundError
-from slrig.jobs.database import Database, RunRow, ScheduleRow
+from slrig.jobs.database import Database, RunRow, ScheduleRow, or_none, readable
 from slrig.jobs.records import stamp
 
 MOST_GRACE_S = 7 * 24 * 3600.0
@@ -326,7 +326,7 @@ class ScheduleStore:
         """Every schedule, oldest first."""
         with self.database.reading() as session:
             query = select(ScheduleRow).order_by(ScheduleRow.created_at, ScheduleRow.id)
-            return [_schedule(row) for row in session.scalars(query)]
+            return list(readable(session.scalars(query), _schedule))
 
     def enable(self, schedule_id: UUID, *, enabled: bool) -> Schedule:
         """Pause a schedule, or let it go on. What was due during the pause is then judged as after any other.
@@ -350,7 +350,8 @@ class ScheduleStore:
             query = select(RunRow).where(RunRow.schedule_id == str(schedule_id))
             if before is not None:
                 query = query.where(RunRow.number < before)
-            return [_run(row) for row in session.scalars(query.order_by(RunRow.number.desc()).limit(limit))]
+            rows = session.scalars(query.order_by(RunRow.number.desc()).execution_options(yield_per=limit))
+            return list(islice(readable(rows, _run), limit))
 
     def counts(self) -> dict[tuple[TaskKind, RunState], int]:
         """How many runs of each task are on record in each state. A row that stands for several counts as those."""
@@ -360,15 +361,18 @@ class ScheduleStore:
             .group_by(ScheduleRow.task, RunRow.state)
         )
         with self.database.reading() as session:
-            return {(TaskKind(task), RunState(state)): int(count) for task, state, count in session.execute(query)}
+            found = list(session.execute(query))
+        known = [(or_none(TaskKind, task), or_none(RunState, state), int(count)) for task, state, count in found]
+        return {(task, state): count for task, state, count in known if task and state}
 
     def record_due(self, now: datetime) -> Sequence[ScheduledRun]:
         """Record what has become due. Returns the rows made."""
         made: list[RunRow] = []
         with self.database.changing() as session:
-            for row in session.scalars(select(ScheduleRow).where(ScheduleRow.enabled)):
-                order = _order(row)
-                found = due_runs(order, datetime.fromisoformat(row.next_due), now)
+            rows = session.scalars(select(ScheduleRow).where(ScheduleRow.enabled))
+            for row, schedule in readable(rows, lambda each: (each, _schedule(each))):
+                order = schedule.order
+                found = due_runs(order, schedule.next_due, now)
                 for due in found.runs:
                     made += self._recorded(session, row, due, now)
                 following = found.next_due
@@ -408,15 +412,15 @@ class ScheduleStore:
             .order_by(RunRow.due, RunRow.number)
         )
         with self.database.reading() as session:
-            return [_run(row) for row in session.scalars(query)]
+            return list(readable(session.scalars(query), _run))
 
     def next_moment(self) -> datetime | None:
         """When something is due or wants to try again next; None if nothing ever is."""
-        due = select(func.min(ScheduleRow.next_due)).where(ScheduleRow.enabled)
+        due = [schedule.next_due for schedule in self.all() if schedule.order.enabled]
         attempt = select(func.min(RunRow.next_attempt)).where(RunRow.state == RunState.WAITING)
         with self.database.reading() as session:
-            found = [first for query in (due, attempt) if (first := session.scalar(query)) is not None]
-            return datetime.fromisoformat(min(found)) if found else None
+            again = or_none(datetime.fromisoformat, session.scalar(attempt))
+        return min([*due, *([] if again is None else [again])], default=None)
 
     def start(self, run: ScheduledRun, now: datetime) -> bool:
         """Take a waiting run; False if somebody else has it, or another run is under way."""
@@ -495,11 +499,13 @@ class ScheduleStore:
         self, query: Select[RunRow], state: RunState, now: datetime, reason: Callable[[RunRow], str]
     ) -> Sequence[ScheduledRun]:
         with self.database.changing() as session:
-            rows = list(session.scalars(query))
-            for row in rows:
+
+            def close(row: RunRow) -> ScheduledRun:
                 _close(row, state, now, reason(row))
                 self._tell(session, row)
-            return [_run(row) for row in rows]
+                return _run(row)
+
+            return list(readable(list(session.scalars(query)), close))
 
     def _tell(self, session: Session, row: RunRow) -> None:
         self._notice(session, _schedule(_found(session, UUID(row.schedule_id))), _run(row))

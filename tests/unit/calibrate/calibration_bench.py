@@ -156,6 +156,7 @@ class CalibrationBench(Bench):
     def restarted(self, *, start: bool = False) -> Calibrations:
         """The calibrations as the next start of the service has them. start : jobs go on."""
         manager = JobManager(self.store, self.folder, RigSession("bench", self.open_rig), self.worker, *KINDS)
+        self.next_rig = manager.rig
         self.patched.callback(manager.close)
         again = Calibrations(manager)
         again.settle()

@@ -257,6 +257,14 @@ def test_failed_solve_states_why_and_another_pose_opens_the_session_again(bench:
     bench.solve(session_id)
 
 
+def used_focal_length(bench: CalibrationBench) -> tuple[str, float]:
+    """Of the camera in the calibration in use, beside the name of its solve."""
+    used = bench.in_use.calibration
+    assert used is not None
+    assert used.solved is not None
+    return used.solved.id, float(used.cameras["cam0"].matrix[0, 0])
+
+
 def test_second_solve_changes_no_calibration_in_use(bench: CalibrationBench) -> None:
     session_id = bench.solved()
     bench.calibrations.activate(session_id)
@@ -265,11 +273,9 @@ def test_second_solve_changes_no_calibration_in_use(bench: CalibrationBench) -> 
     assert bench.solve(session_id).solve == 2
     # The solve was held against the one in use.
     assert [None if each is None else each.cameras["cam0"].matrix[0, 0] for each in bench.tame.earlier] == [None, 80.0]
-    assert bench.in_use.calibration.cameras["cam0"].matrix[0, 0] == 80.0
+    assert used_focal_length(bench) == (str(session_id), 80.0)
     bench.calibrations.activate(session_id)
-    assert bench.in_use.calibration.solved is not None
-    assert bench.in_use.calibration.solved.id == f"{session_id}.2"
-    assert bench.in_use.calibration.cameras["cam0"].matrix[0, 0] == 81.0
+    assert used_focal_length(bench) == (f"{session_id}.2", 81.0)
 
 
 def test_calibration_in_use_is_not_deleted_and_can_be_let_go(bench: CalibrationBench) -> None:
@@ -382,7 +388,7 @@ def test_poses_outlive_their_records_and_records_do_not_outlive_their_files(benc
     assert len(again.accepted) == len(poses)
     shutil.rmtree(bench.calibrations.store.pose(session_id, 1))
     lost = bench.restarted().register.pose(session_id, 1)
-    assert (lost.state, None if lost.fault is None else lost.fault.code) == (JobState.FAILED, "storage")
+    assert (lost.state, None if lost.fault is None else lost.fault.code) == (JobState.FAILED, "damaged")
 
 
 def test_links_are_not_followed_and_folders_of_no_session_put_aside(bench: CalibrationBench, tmp_path: Path) -> None:
@@ -406,12 +412,28 @@ def test_links_are_not_followed_and_folders_of_no_session_put_aside(bench: Calib
     assert (elsewhere / "session.json").is_file()
 
 
-def test_active_calibration_that_is_gone_ends_the_start(bench: CalibrationBench) -> None:
+@pytest.mark.parametrize("damage", ["gone", "one digit", "pointer"])
+def test_active_calibration_that_is_damaged_refuses_scans_until_another_is_chosen(
+    bench: CalibrationBench, damage: str
+) -> None:
     session_id = bench.solved()
     bench.calibrations.activate(session_id)
-    (bench.calibrations.store.solve(session_id, 1) / "calibration.json").unlink()
-    with pytest.raises(StorageError, match=r"active calibration .* cannot be read .* Remove .*active\.json"):
-        bench.restarted()
+    path = bench.calibrations.store.solve(session_id, 1) / "calibration.json"
+    text = path.read_text()
+    if damage == "gone":
+        path.unlink()
+    elif damage == "one digit":
+        # Still a calibration, and a wrong one.
+        path.write_text(text.replace("1", "2", 1))
+    else:
+        (bench.folder.calibrations / "active.json").write_text("{}")
+    again = bench.restarted()
+    rig = bench.next_rig
+    with pytest.raises(CalibrationError, match=r"(?s)active calibration cannot be read.*Activate another one"):
+        rig.refuse_misfit()
+    path.write_text(text)
+    again.activate(session_id)
+    rig.refuse_misfit()
 
 
 def a_scan(bench: CalibrationBench, *, report: object = None, bundle: UUID | None = None) -> None:

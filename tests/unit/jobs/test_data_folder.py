@@ -135,6 +135,7 @@ def finished(folder: DataFolder, record: JobRecord) -> None:
     (place / "mesh.ply").write_bytes(b"ply")
     (place / "report.json").write_text("{}")
     write_record(place, replace(record, state=JobState.SUCCEEDED, summary=SUMMARY))
+    write_entries(place)
 
 
 def test_space_is_asked_for_before_a_scan(tmp_path: Path) -> None:
@@ -257,11 +258,12 @@ def test_start_says_when_the_files_of_a_scan_are_gone(
     finished(folder, store.get(scan_id))
     for name in gone:
         (folder.scan(scan_id) / name).unlink()
-    assert settled(store, folder) == {"without files": {str(scan_id)}}
+    assert settled(store, folder) == {"damaged": {str(scan_id)}}
     record = store.get(scan_id)
     assert record.state is JobState.FAILED
     assert record.fault is not None
-    assert record.fault.message.startswith(f"{' and '.join(gone)} of this reconstruction is gone")
+    assert record.fault.code == "damaged"
+    assert all(f"{name} is gone" in record.fault.message for name in gone)
 
 
 @pytest.mark.parametrize("name", ["mesh.ply", "report.json", FILES])
@@ -271,7 +273,6 @@ def test_start_says_which_files_of_a_scan_are_damaged(
 ) -> None:
     scan_id = running(store, JobState.COMPUTING)
     finished(folder, store.get(scan_id))
-    write_entries(folder.scan(scan_id))
     assert store.finish(scan_id, JobState.SUCCEEDED, summary=SUMMARY)
     assert settled(store, folder) == {}
     path = folder.scan(scan_id) / name
@@ -283,10 +284,6 @@ def test_start_says_which_files_of_a_scan_are_damaged(
         path.write_bytes(content[:-1] if damage == "cut" else b"")
     settled(store, folder)
     record = store.get(scan_id)
-    if (name, damage) == (FILES, "removed"):
-        # A folder of an earlier version, which had no list.
-        assert record.state is JobState.SUCCEEDED
-        return
     assert (record.state, record.fault is None) == (JobState.FAILED, False)
     assert record.fault is not None
     assert name in record.fault.message
@@ -316,7 +313,6 @@ def test_check_names_each_damaged_file_of_a_data_folder(store: JobStore, folder:
         scan_id = running(store, JobState.COMPUTING)
         finished(folder, store.get(scan_id))
         places.append(folder.scan(scan_id))
-        write_entries(places[-1])
     staged = folder.stage(uuid4())
     write_entries(staged)
     whole = slrig("check", folder.root)
@@ -340,7 +336,6 @@ def test_check_names_each_damaged_file_of_a_data_folder(store: JobStore, folder:
 def test_a_damaged_file_is_in_no_backup(tmp_path: Path, store: JobStore, folder: DataFolder) -> None:
     scan_id = running(store, JobState.COMPUTING)
     finished(folder, store.get(scan_id))
-    write_entries(folder.scan(scan_id))
     store.finish(scan_id, JobState.SUCCEEDED, summary=SUMMARY)
     (folder.scan(scan_id) / "mesh.ply").write_bytes(b"plz")
     made = backup.back_up(folder.root, tmp_path / "backup")
@@ -365,10 +360,12 @@ def test_start_puts_finished_scans_on_record_again_beside_a_database_that_was_lo
         store.delete(record.id)
     (folder.scan(records[1].id) / "mesh.ply").unlink()
     assert settled(store, folder) == {
-        "recovered": {str(records[0].id), str(records[2].id)}, "put aside": {str(records[1].id)},
+        "recovered": {str(record.id) for record in records}, "damaged": {str(records[1].id)},
     }  # fmt: skip
-    newest, oldest = store.page(before=None, limit=10)
-    assert (newest.id, oldest.id) == (records[0].id, records[2].id)
+    newest, damaged, oldest = store.page(before=None, limit=10)
+    assert (newest.id, damaged.id, oldest.id) == tuple(record.id for record in records)
+    assert damaged.fault is not None
+    assert damaged.fault.code == "damaged"
     assert (newest.state, newest.label, newest.created_at) == (JobState.SUCCEEDED, "part 0", made)
     assert plan_from_json(newest.plan) == plan
     assert newest.summary == SUMMARY
@@ -444,7 +441,7 @@ def test_links_in_the_data_folder_are_neither_followed_nor_fatal(
     assert list(folder.incoming.iterdir()) == []
     assert sorted(elsewhere.iterdir()) == before
     assert found == {
-        "without files": {str(linked)}, "put aside": {str(stray)}, "interrupted": {str(cut), str(hollow)},
+        "damaged": {str(linked)}, "put aside": {str(stray)}, "interrupted": {str(cut), str(hollow)},
     }  # fmt: skip
     assert (folder.scan(cut) / "bundle" / "bundle.json").is_file()
 

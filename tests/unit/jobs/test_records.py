@@ -16,7 +16,7 @@ from sqlalchemy import create_engine, text
 from slrig.errors import IdempotencyError, JobNotFoundError, KeyInFlightError, StorageError
 from slrig.failure import JobFailure
 from slrig.jobs import database as module
-from slrig.jobs.database import Base, Database, sqlite_engine
+from slrig.jobs.database import UNREADABLE, Base, Database, sqlite_engine
 from slrig.jobs.job import ProgressRecorder
 from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, Stage, stages_of
 from slrig.jobs.store import JobStore, RequestKeys
@@ -321,10 +321,80 @@ def test_programs_that_open_a_new_file_together_wait_for_one_another(
     assert len(waits) == 1
 
 
-def test_file_that_is_no_database_is_refused(path: Path) -> None:
-    path.write_bytes(b"not a database, for certain" * 100)
-    with pytest.raises(StorageError, match=r"slrig\.sqlite"):
-        Database(path)
+def spoilt(path: Path, damage: str) -> None:
+    """Damage a database of 200 jobs."""
+    content = bytearray(path.read_bytes())
+    match damage:
+        case "garbage":
+            content = bytearray(b"not a database, for certain" * 100)
+        case "head":
+            content[:32] = bytes(32)
+        case "a page":
+            content[30 * 4096 : 31 * 4096] = bytes(range(256)) * 16
+        case "cut":
+            del content[36 * 4096 :]
+        case "emptied":
+            content.clear()
+        case _:
+            path.unlink()
+            path.mkdir()
+            return
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("damage", ["garbage", "head", "a page", "cut", "emptied", "a folder"])
+def test_a_damaged_database_is_put_aside_and_its_readable_rows_taken_over(path: Path, damage: str) -> None:
+    before = Database(path)
+    made = JobStore(before).create_all([{"number": i} for i in range(200)], kind=JobKind.SCAN, rig="bench")
+    before.close()
+    spoilt(path, damage)
+    database = Database(path, aside=path.parent / ".orphans")
+    store = JobStore(database)
+    found = {record.id for record in store.unfinished()}
+    assert found <= {record.id for record in made}
+    assert len(found) >= (60 if damage in {"a page", "cut"} else 0)
+    store.create({}, kind=JobKind.SCAN, rig="bench")
+    database.close()
+    # An empty file is a new database.
+    assert len(list((path.parent / ".orphans").glob("*"))) == (0 if damage == "emptied" else 1)
+    Database(path).close()
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"plan": "{", "created_at": "yesterday"}, {"summary": "[1]"}, {"state": "what"}, {"plan": b"\xff\xfe"},
+        {"fraction": "half"}, {"finished_at": 7}, {"plan": "[" * 100_000}, {"parent": "nobody"},
+    ],
+    ids=lambda changed: "+".join(changed),
+)  # fmt: skip
+def test_a_row_that_cannot_be_read_is_a_failed_job_beside_the_others(
+    path: Path, changed: dict[str, object], clock: SetClock
+) -> None:
+    store = JobStore(Database(path), clock=clock)
+    first, bad, last = store.create_all([{}] * 3, kind=JobKind.SCAN, rig="bench", label="part")
+    file = sqlite3.connect(path)
+    for column, value in changed.items():
+        file.execute(f"UPDATE job SET {column} = ? WHERE id = ?", (value, str(bad.id)))  # noqa: S608
+    file.commit()
+    for _ in range(2):
+        # While the service runs, and after its next start.
+        listed = store.page(before=None, limit=10)
+        assert [record.id for record in listed] == [last.id, bad.id, first.id]
+        assert [record.fault == UNREADABLE for record in listed] == [False, True, False]
+        assert (listed[1].state, listed[1].plan, listed[1].label) == (JobState.FAILED, {}, "part")
+        assert store.states()[first.id] is JobState.QUEUED
+        assert [record.id for record in store.unreadable()] == [bad.id]
+    assert store.damaged() == {JobKind.SCAN: 1}
+    assert [record.id for record in store.unfinished()] == [first.id, last.id]
+    store.delete(bad.id)
+    assert [record.id for record in store.page(before=None, limit=10)] == [last.id, first.id]
+    file.execute("UPDATE job SET id = 'x' WHERE id = ?", (str(last.id),))
+    file.commit()
+    file.close()
+    store.unreadable()
+    assert [record.id for record in store.page(before=None, limit=10)] == [first.id]
+    store.database.close()
 
 
 @pytest.mark.parametrize("version", ["0001", "records99"])

@@ -219,7 +219,7 @@ def test_what_was_cut_off_is_made_again_and_no_file_is_lost(tmp_path: Path) -> N
     lost = bench.over(gone)
     assert lost.state is JobState.FAILED
     assert lost.fault is not None
-    assert f"{MODEL} of this model is gone" in lost.fault.message
+    assert f"{MODEL} is gone" in lost.fault.message
     assert deleted not in bench.store.states(JobKind.MODEL)
     assert {each.name for each in bench.models.place(gone).parent.iterdir()} == {
         str(each) for each in (queued, once, placed, gone)
