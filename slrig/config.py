@@ -241,7 +241,8 @@ class ServiceSettings(BaseSettings):
     removed unless a setting sets a limit: `keep_calibrations`, `keep_models`, `keep_scans` (their numbers),
     `keep_scans_days`, `keep_scans_bytes`. Beyond it the oldest are removed, failed ones first and counted apart, except
     pinned ones, those whose files were requested in the last quarter of an hour, and calibrations that are in use or
-    that a scan or an acceptance test names. `backlog_length` is the number of scans
+    that a scan or an acceptance test names. They lie in `.trash` of the data folder for a day. `backlog_length` is the
+    number of scans
     that may be reconstructed, or wait for that, while the rig captures the next one; other computations count too.
     `drain_s` is the time after SIGTERM in which the job that has the rig and those that compute may end before they are
     interrupted; jobs that wait, or have all their frames, continue at the next start. `compute` is the scheduler of a

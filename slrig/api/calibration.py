@@ -198,6 +198,7 @@ class CalibrationBody(CalibrationSummary):
     patterns: PatternPlan
     shot: list[PoseBody] = Field(description="every pose, refused and failed ones too")
     script: list[int] = Field(description="positions of the positioner that are still to be taken")
+    pinned: bool = Field(description="kept, whatever the settings say of old calibrations")
     coverage: dict[str, Any] | None = Field(
         description="by device: a 6 x 6 grid of how many poses were seen where, depths, tilts and turns; and what is "
         "still missing, in words"
@@ -544,6 +545,18 @@ def activate_calibration(service: Serving, calibration_id: UUID) -> CalibrationB
 def deactivate_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
     """Have the scans that follow use the rig's own calibration again."""
     return _answered(service, service.calibrations.deactivate(calibration_id))
+
+
+@router.put("/{calibration_id}/pin", responses=problems(507))
+def pin_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
+    """Keep a calibration, whatever the settings say of old ones. DELETE lets it go the way of the others again."""
+    return _answered(service, service.calibrations.pin(calibration_id, pinned=True))
+
+
+@router.delete("/{calibration_id}/pin", responses=problems(507))
+def unpin_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
+    """Let a calibration be removed when it is old, where the settings ask for that."""
+    return _answered(service, service.calibrations.pin(calibration_id, pinned=False))
 
 
 @router.delete("/{calibration_id}", status_code=204, responses=problems(409, 507))

@@ -188,7 +188,7 @@ def _file(service: Service, scan_id: UUID, name: str, media_type: str, known: st
     with _converting if is_made else nullcontext():
         # Looked up now: while others waited for their conversion the scan may have ended, and then this one is kept.
         record = service.store.get(scan_id, JobKind.SCAN)
-        service.retentions[JobKind.SCAN].reading(scan_id)
+        service.retention.reading(scan_id)
         if is_made and record.state.final and service.folder.owns(place / MESH) and not os.path.lexists(path):
             require_whole(service, record, place, MESH)
             write_converted(place, name)
@@ -238,7 +238,7 @@ def _cloud(service: Service, scan_id: UUID, form: str, camera: str | None, known
     place = service.folder.scan(scan_id)
     path = place / form.format(camera=camera)
     record = service.store.get(scan_id, JobKind.SCAN)
-    service.retentions[JobKind.SCAN].reading(scan_id)
+    service.retention.reading(scan_id)
     if not record.state.final or not has_sources(service.folder, place, camera):
         refuse_absent(record, path.name)
     headers = _headers(scan_id, path.name, place)
@@ -396,7 +396,7 @@ def fetch_bundle(service: Serving, scan_id: UUID, known: KnownTag = None) -> Res
     A scan whose reconstruction failed has its bundle, too.
     """
     record = service.store.get(scan_id, JobKind.SCAN)
-    service.retentions[JobKind.SCAN].reading(scan_id)
+    service.retention.reading(scan_id)
     bundle = service.folder.scan(scan_id) / BUNDLE
     if not record.state.final or not service.folder.owns(bundle):
         refuse_absent(record, BUNDLE_ZIP)

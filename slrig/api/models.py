@@ -184,7 +184,7 @@ def _serve(name: str, media_type: str) -> Callable[..., Response]:
         record, path = service.store.get(model_id, JobKind.MODEL), service.models.place(model_id) / name
         if record.state is not JobState.SUCCEEDED or not service.folder.owns(path):
             refuse_absent(record, name)
-        service.retentions[JobKind.MODEL].reading(model_id)
+        service.retention.reading(model_id)
         require_whole(service, record, path.parent, name)
         return kept_file(path, media_type, model_id, known)
 

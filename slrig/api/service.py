@@ -19,7 +19,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from slrig.accept.job import AcceptanceTests
 from slrig.bundle import Preset, ScanDefaults
-from slrig.calibrate.job import Calibrations, Retention
+from slrig.calibrate.job import CalibrationArchive, Calibrations
 from slrig.calibrate.verification import RigHealth
 from slrig.catalogue.store import Copier, catalogue_of, standing
 from slrig.config import ServiceSettings
@@ -38,9 +38,9 @@ from slrig.jobs.records import (
     utc_now,
 )
 from slrig.jobs.resume import resume
-from slrig.jobs.retention import CLOCK, JobRetention, Limits, SteadyClock
+from slrig.jobs.retention import CLOCK, JobArchive, Limits, Retention, SteadyClock
 from slrig.jobs.store import Audit, AuditEntry, JobStore, RequestKeys
-from slrig.model_jobs.job import TURNTABLE, Models, ViewShooting
+from slrig.model_jobs.job import MODELS, TURNTABLE, Models, ViewShooting
 from slrig.model_jobs.turntable import TurntableStore
 from slrig.plugins import OBSERVERS, load
 from slrig.scan.plan import Presets
@@ -200,27 +200,33 @@ class Service:
         resume(manager)
         self.shooting.take_up()
         self.store.after_end = self._ended
-        self.retention = Retention(
-            self.calibrations,
-            self.folder,
-            keep=settings.keep_calibrations,
-            named=lambda: {test.calibration for test in self.acceptance.latest()},
-        )
         self.copier = self._copier()
         self._tellers = (*self.senders, *(() if self.copier is None else (self.copier,)))
-        finished = self.store.finished(JobKind.SCAN)[:1]
-        clock = SteadyClock(self.folder.root / CLOCK, first=finished[0].finished_at if finished else None)
-        limits = Limits(settings.keep_scans, settings.keep_scans_days, settings.keep_scans_bytes)
-        self.retentions = {
-            JobKind.SCAN: JobRetention(
-                self.store, JobKind.SCAN, limits, self.folder.scan, self.delete_scan, clock=clock.now
-            ),
-            JobKind.MODEL: JobRetention(
-                self.store, JobKind.MODEL, Limits(settings.keep_models), self.models.place, self.manager.delete
-            ),
-        }
+        newest = self.store.page(JobKind.SCAN, before=None, limit=1)
+        self.retention = Retention(
+            self.folder.root,
+            [
+                (
+                    JobArchive(manager, JobKind.SCAN, self.folder.scans, self.models.unused),
+                    Limits(settings.keep_scans, settings.keep_scans_days, settings.keep_scans_bytes),
+                ),
+                (JobArchive(manager, JobKind.MODEL, self.folder.root / MODELS), Limits(settings.keep_models)),
+                (
+                    CalibrationArchive(
+                        self.calibrations,
+                        self.folder.scans,
+                        named=lambda: {test.calibration for test in self.acceptance.latest()},
+                    ),
+                    Limits(settings.keep_calibrations),
+                ),
+            ],
+            self.audit,
+            SteadyClock(self.folder.root / CLOCK, first=newest[0].created_at if newest else None),
+        )
         self.schedules = ScheduleStore(database, notice=partial(tell_run, outbox))
-        self.tasks = Tasks(manager, self.calibrations, self.acceptance, tidy=self.retention)
+        self.tasks = Tasks(
+            manager, self.calibrations, self.acceptance, tidy=partial(self.retention.look, "calibration")
+        )
         # The folder's lock keeps every other process out.
         self.scheduler = Scheduler(self.schedules, self.tasks, alone=True)
 
@@ -243,8 +249,7 @@ class Service:
         """Measure a job that is over, make room, and go on with the model that a scan is a view of."""
         if record.kind is JobKind.SCAN:
             self.shooting.view_ended(record)
-        if record.kind in self.retentions:
-            self.retentions[record.kind].look()
+        self.retention.look(record.kind)
         try:
             if record.kind is JobKind.VERIFICATION or record.kind in RIG_JOBS:
                 self.store.prune(record.kind, _MOST_ON_RECORD)
@@ -261,11 +266,8 @@ class Service:
             sender.start()
         self.manager.start()
         self.scheduler.start()
-        # It reads the report of every scan, and nobody waits for it.
-        for retention in self.retentions.values():
-            retention.start()
+        self.retention.start()
         self._lasting = _lasting_threads()
-        threading.Thread(target=self.retention, name="slrig-retention", daemon=True).start()
 
     def dead_threads(self) -> list[str]:
         """Names of threads that have ended, and should last as long as the service."""
@@ -279,8 +281,7 @@ class Service:
 
     def end_work(self) -> None:
         """Stop scanning and calibrating, and record what was cut off. Idempotent."""
-        for retention in self.retentions.values():
-            retention.close()
+        self.retention.close()
         self.scheduler.stop()
         self.tasks.end()
         self.scheduler.close(timeout_s=min(_SCHEDULE_END_S, self.settings.shutdown_s))
@@ -306,7 +307,7 @@ def _lasting_threads() -> frozenset[str]:
         "slrig-rig",
         "slrig-watchdog",
         "slrig-schedule",
-        "slrig-scan-retention",
+        "slrig-retention",
         "slrig-notices",
         "slrig-catalogue",
     }

@@ -6,7 +6,7 @@ import json
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -49,13 +49,12 @@ from slrig.disk import storage_errors
 from slrig.errors import (
     ArtefactNotReadyError,
     CalibrationError,
-    CalibrationNotFoundError,
     CalibrationStateError,
     CameraNotFoundError,
+    DamagedError,
     PoseRefusedError,
     SlrigError,
     SolveRefusedError,
-    StorageError,
     UnsupportedByDeviceError,
 )
 from slrig.failure import JobFailure, disk_errors
@@ -64,6 +63,7 @@ from slrig.jobs.database import or_none
 from slrig.jobs.job import Job, JobRun, Outcome, Recording
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import Holder, JobKind, utc_now
+from slrig.jobs.retention import Kept
 from slrig.jobs.worker import Task
 from slrig.model import Calibration, Size
 from slrig.rig.session import ActiveCalibration, RigFacts, RigSession
@@ -715,8 +715,16 @@ class Calibrations:
         used = self._manager.rig.active
         return None if used is None else or_none(UUID, used.name)
 
-    def delete(self, session_id: UUID) -> None:
-        """Remove a calibration with all its poses.
+    def pin(self, session_id: UUID, *, pinned: bool) -> SessionRecord:
+        """Have a calibration kept by every retention, or not any more.
+
+        Raises CalibrationNotFoundError, StorageError.
+        """
+        self.register.change(session_id, pinned=pinned)
+        return self.register.get(session_id)
+
+    def delete(self, session_id: UUID, trash: Path | None = None) -> None:
+        """Remove a calibration with all its poses, or move it to `trash`.
 
         Raises CalibrationNotFoundError, and CalibrationStateError if it is in use or something is under way in it.
         """
@@ -731,7 +739,7 @@ class Calibrations:
             if record.under_way:
                 message = f"Something is under way in calibration {session_id}. Wait for it, then delete it."
                 raise CalibrationStateError(message)
-            self.register.remove(session_id)
+            self.register.remove(session_id, trash)
         _log.info("calibration deleted", calibration=str(session_id))
 
     def calibration(self, session_id: UUID) -> Calibration:
@@ -823,56 +831,45 @@ def _position(asked: int | str | None, facts: RigFacts | None) -> tuple[int | No
 
 
 @dataclass(frozen=True, slots=True)
-class Retention:
-    """Keeps the newest calibrations of a data folder, and those that are needed. Any thread may call.
+class CalibrationArchive:
+    """The calibrations as a retention looks at them: see `Archive`. Those without a solve are counted apart.
 
-    keep : so many are kept whatever they are, those without a solve counted apart; None for all.
-    named : further names of calibrations that are needed.
+    scans : the folder of the scans, which name calibrations. named : gives further names that are needed.
     """
 
     calibrations: Calibrations
-    folder: DataFolder
-    keep: int | None
+    scans: Path
     named: Callable[[], set[str]] = set
+    kind: str = "calibration"
 
-    def __call__(self) -> tuple[UUID, ...]:
-        """Remove what is neither new nor needed, say so in the log, and return which."""
-        if self.keep is None:
-            return ()
-        records = self.calibrations.latest()
-        kinds = ([each for each in records if each.solve], [each for each in records if not each.solve])
-        old = [each for kind in kinds for each in kind[self.keep :] if not each.under_way]
-        if not old:
-            return ()
-        needed = named_by_scans(self.folder.scans) | {_session_of(name) for name in self.named()}
-        removed = []
-        for record in reversed(old):
-            if self._names(record) & needed:
-                continue
-            try:
-                self.calibrations.delete(record.id)
-            except (CalibrationNotFoundError, CalibrationStateError):
-                # Gone, in use, or taken up again meanwhile.
-                continue
-            except StorageError as error:
-                _log.warning("an old calibration could not be removed", calibration=str(record.id), cause=str(error))
-                continue
-            removed.append(record.id)
-            _log.info(
-                "old calibration removed",
-                calibration=str(record.id),
-                label=record.label,
-                opened=record.created_at.isoformat(timespec="seconds"),
-                poses=len(record.poses),
-                kept=self.keep,
+    def kept(self) -> Sequence[Kept]:
+        """See `Archive`."""
+        return [
+            Kept(
+                each.id, each.label, each.created_at, each.solved_at or each.created_at,
+                each.solve > 0, each.pinned or each.under_way,
             )
-        return tuple(removed)
+            for each in self.calibrations.latest()
+        ]  # fmt: skip
+
+    def needed(self, old: Collection[UUID]) -> Collection[UUID]:
+        """See `Archive`: those that scans were measured by, and what else is named."""
+        named = named_by_scans(self.scans) | set(map(_session_of, self.named()))
+        return [each for each in old if self._names(self.calibrations.register.get(each)) & named]
+
+    def place(self, item: UUID) -> Path:
+        """See `Archive`."""
+        return self.calibrations.store.folder(item)
+
+    def remove(self, item: UUID, trash: Path) -> None:
+        """See `Archive`."""
+        self.calibrations.delete(item, trash)
 
     def _names(self, record: SessionRecord) -> set[str]:
         """What a scan may call it by."""
         names = {str(record.id)}
         for number in range(1, record.solve + 1):
-            with suppress(CalibrationError):
+            with suppress(CalibrationError, DamagedError):
                 names.add(_session_of(self.calibrations.store.calibration(record.id, number).solve_id))
         return names
 

@@ -137,7 +137,7 @@ class SessionRecord:
     number : rises with every calibration and orders lists. board : None where it was imported. cameras, projector :
     the extents of the rig's devices, from the first pose on. latest_pose : the highest number given. state : on disk
     never SOLVING. solve : the number of the last solve that went well, 0 before; result : its figures as JSON values.
-    script : positions that are still to be taken.
+    script : positions that are still to be taken. pinned : no retention removes it.
 
     The last four are of its jobs, and not on disk. fault : of the last solve. progress : of what is under way.
     under_way : whether a pose is being shot or read, or a solve runs.
@@ -160,6 +160,7 @@ class SessionRecord:
     coverage: Mapping[str, Any] | None = None
     next_move: Mapping[str, Any] | None = None
     script: tuple[int, ...] = ()
+    pinned: bool = False
     poses: tuple[PoseRecord, ...] = ()
     progress: JobProgress | None = None
     fault: JobFailure | None = None
@@ -404,9 +405,9 @@ class CalibrationStore:
         """Put a session on record in place of what it was."""
         write_file(self.folder(session.id) / SESSION, session_json(session))
 
-    def delete(self, session_id: UUID) -> None:
-        """Remove a calibration with all its files: by one rename out of place first."""
-        self._folder.remove(self.folder(session_id))
+    def delete(self, session_id: UUID, trash: Path | None = None) -> None:
+        """Remove a calibration with all its files, or move it to `trash`: by one rename out of place first."""
+        self._folder.remove(self.folder(session_id), trash)
 
     def discard_pose(self, session_id: UUID, number: int) -> None:
         """Remove a pose. Idempotent."""
@@ -605,10 +606,10 @@ class CalibrationRegister:
             self._sessions[session_id] = session
             return session
 
-    def remove(self, session_id: UUID) -> None:
-        """Forget a calibration with its jobs, and remove its files. Raises StorageError."""
+    def remove(self, session_id: UUID, trash: Path | None = None) -> None:
+        """Forget a calibration with its jobs, and remove its files, or move them to `trash`. Raises StorageError."""
         with self.lock:
-            self.store.delete(session_id)
+            self.store.delete(session_id, trash)
             del self._sessions[session_id]
         self.jobs.delete_of(session_id)
 

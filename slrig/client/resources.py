@@ -384,6 +384,14 @@ class CalibrationResource(Resource):
         """Delete a calibration."""
         self._connection.send("DELETE", path("/calibration/{}", calibration_id))
 
+    def pin(self, calibration_id: str) -> Json:
+        """Keep a calibration, even where the settings delete old ones."""
+        return self._connection.json("PUT", path("/calibration/{}/pin", calibration_id))
+
+    def unpin(self, calibration_id: str) -> Json:
+        """Let the settings delete a calibration once it is old."""
+        return self._connection.json("DELETE", path("/calibration/{}/pin", calibration_id))
+
     def shoot(
         self,
         calibration_id: str,

@@ -12,6 +12,7 @@ DATA/clock.json      the time that ages are reckoned by: see `slrig.jobs.retenti
 DATA/doctor.json     what `slrig doctor` found last, and conform.json: see `slrig.doctor.job`
 DATA/.incoming/ID/   a scan, a pose, a solve or a model being made; swept at the next start
 DATA/.orphans/ID/    files found at start that no record knows, a damaged database; kept: they may be somebody's work
+DATA/.trash/         what the limits of the settings removed, for a day: see `slrig.jobs.retention`
 DATA/cache/          compiled kernels, where the package's own folder cannot be written
 """
 
@@ -274,7 +275,8 @@ class DataFolder:
         if free < needed_bytes:
             message = (
                 f"This may need {needed_bytes / 1e6:.0f} MB in {self.root}, and {free / 1e6:.0f} MB are free. "
-                "Delete scans that are no longer wanted (DELETE /scan/ID), or move the data folder to a larger disk."
+                "Delete scans that are no longer wanted (DELETE /scan/ID), empty .trash there, or move the data folder "
+                "to a larger disk."
             )
             raise StorageError(message)
 
@@ -360,14 +362,18 @@ class DataFolder:
             require_whole(place, *unknown, remedy="They are not given out.")
         self._whole.update(looked)
 
-    def remove(self, place: Path) -> None:
-        """Remove files by one rename out of their place first. Idempotent. Raises StorageError."""
+    def remove(self, place: Path, trash: Path | None = None) -> None:
+        """Remove files by one rename out of their place first, or move them to `trash`. Idempotent.
+
+        Raises StorageError.
+        """
         if not os.path.lexists(place):
             return
-        gone = self.incoming / f"gone-{uuid4().hex}"
+        gone = trash or self.incoming / f"gone-{uuid4().hex}"
         with disk_errors(place):
             place.rename(gone)
-        shutil.rmtree(gone, ignore_errors=True)
+        if trash is None:
+            shutil.rmtree(gone, ignore_errors=True)
 
     def put_aside(self, place: Path) -> None:
         """Move files that no record knows to `orphans`."""
@@ -396,8 +402,10 @@ class DataFolder:
                 remove(other)
         return staged
 
-    def discard(self, scan_id: UUID) -> None:
-        """Remove what was staged for a scan. Idempotent."""
+    def discard(self, scan_id: UUID, trash: Path | None = None) -> None:
+        """Remove what was staged for a scan, or move it to `trash`, which may raise StorageError. Idempotent."""
+        if trash is not None:
+            self.remove(self.staging(scan_id), trash)
         shutil.rmtree(self.staging(scan_id), ignore_errors=True)
 
     def withdraw(self, place: Path, job_id: UUID) -> None:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 from uuid import UUID, uuid4
 
@@ -353,8 +354,10 @@ class JobManager:
             unwatch()
         return self.store.get(job_id)
 
-    def delete(self, job_id: UUID, unused: AbstractContextManager[object] | None = None) -> None:
-        """Remove a job that is over: its record, its events, its files. Raises JobNotFoundError, ScanStateError.
+    def delete(
+        self, job_id: UUID, unused: AbstractContextManager[object] | None = None, trash: Path | None = None
+    ) -> None:
+        """Remove a job that is over, or move its files to `trash`. Raises JobNotFoundError, ScanStateError.
 
         unused : entered meanwhile; it raises where something else needs the job.
         """
@@ -362,11 +365,8 @@ class JobManager:
         self.settle()
         record = self.store.get(job_id)
         if not record.state.final:
-            path = holder_of(record).path
-            message = (
-                f"{record.kind.capitalize()} {job_id} is {record.state}. Cancel it first (POST {path}/cancel), then "
-                "delete it."
-            )
+            how = f"POST {holder_of(record).path}/cancel"
+            message = f"{record.kind.capitalize()} {job_id} is {record.state}. Cancel it first ({how}), then delete it."
             raise ScanStateError(message)
         place = self.kinds[record.kind].place_of(record, self.data)
         with unused or nullcontext():
@@ -374,7 +374,7 @@ class JobManager:
             if place is not None:
                 self.data.withdraw(place, job_id)
             self.store.delete(job_id)
-        self.data.discard(job_id)
+        self.data.discard(job_id, trash)
         _log.info("job deleted", kind=str(record.kind), job=str(job_id))
 
     def watch(self, camera: str, light: Light) -> Watch:

@@ -1,22 +1,37 @@
-"""Old jobs: which of a kind are removed, and when, where the settings set limits."""
+"""What is removed by itself, and when, where the settings set limits: old jobs and calibrations.
+
+DATA/.trash/SECOND-KIND-ID    what was removed less than a day of the service ago; moved back to its place it is on
+                              record again after the next start
+"""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
+from typing import Protocol
 from uuid import UUID
 
 import structlog
 from pydantic import BaseModel, ValidationError
 
 from slrig.bundle import write_file
-from slrig.errors import JobNotFoundError, ScanStateError, StorageError
-from slrig.jobs.records import Clock, JobKind, JobRecord, JobState, utc_now
-from slrig.jobs.store import JobStore
+from slrig.errors import (
+    CalibrationNotFoundError,
+    CalibrationStateError,
+    JobNotFoundError,
+    ScanStateError,
+    StorageError,
+)
+from slrig.failure import disk_errors
+from slrig.jobs.data_folder import remove
+from slrig.jobs.manager import JobManager
+from slrig.jobs.records import Clock, JobKind, JobState, utc_now
+from slrig.jobs.store import Audit
 
 CLOCK = "clock.json"
 """In the data folder: the state of a `SteadyClock`."""
@@ -33,6 +48,9 @@ MAX_JUMP = timedelta(days=1)
 
 DOUBT_S = 7 * 86400.0
 """How long the service has to run before it believes a clock that jumped by more."""
+
+TRASH, TRASH_S = ".trash", 86400.0
+"""Where what was removed lies in the data folder, and for how many seconds in which the service runs."""
 
 _END_S = 1.0
 """How long the end of the service waits for a removal under way; the next start completes one that is cut off."""
@@ -55,10 +73,13 @@ class Limits:
 
 
 class _ClockState(BaseModel, extra="forbid"):
-    """What is kept of a `SteadyClock`: the time that it believes, and for how long the system's has differed."""
+    """What is kept of a `SteadyClock`: the time that it believes, for how long the system's has differed, and how long
+    services have run.
+    """
 
     time: datetime
     doubt_s: float
+    ran_s: float = 0.0
 
 
 class SteadyClock:
@@ -101,131 +122,228 @@ class SteadyClock:
                 )
             doubt_s = self._state.doubt_s + max(elapsed_s, 1e-3)
         believed = doubt_s == 0.0 or doubt_s >= DOUBT_S
-        self._state = _ClockState(time=wall if believed else expected, doubt_s=0.0 if believed else doubt_s)
+        self._state = _ClockState(
+            time=wall if believed else expected,
+            doubt_s=0.0 if believed else doubt_s,
+            ran_s=self._state.ran_s + max(elapsed_s, 0.0),
+        )
         write_file(self._file, self._state.model_dump_json().encode())
         return min(wall, self._state.time)
 
+    @property
+    def ran_s(self) -> float:
+        """For how many seconds services have run on the data folder, by the monotonic clock, as of the last `now`."""
+        return self._state.ran_s
 
-class JobRetention:
-    """Removes jobs of a kind beyond the limits, on a thread of its own. Any thread may call.
 
-    Only jobs that succeeded count; those that failed have a count of their own, and go first. Pinned ones, and those
-    whose files somebody reads, stay.
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """One job that is over, or one calibration. created_at, ended_at : as its record says. pinned : it stays."""
 
-    place : where the files of a job lie. delete : removes a job, or raises ScanStateError where it is in use.
-    clock : for ages; see `SteadyClock`.
+    id: UUID
+    label: str | None
+    created_at: datetime
+    ended_at: datetime
+    succeeded: bool
+    pinned: bool
+
+
+class Archive(Protocol):
+    """All of a kind that is over."""
+
+    @property
+    def kind(self) -> str:
+        """What its path and its settings call it."""
+        ...
+
+    def kept(self) -> Sequence[Kept]:
+        """Return them, newest first."""
+        ...
+
+    def needed(self, old: Collection[UUID]) -> Collection[UUID]:
+        """Return those of them that something else needs."""
+        ...
+
+    def place(self, item: UUID) -> Path:
+        """Return the folder of its files."""
+        ...
+
+    def remove(self, item: UUID, trash: Path) -> None:
+        """Take it off record, and move its folder to `trash`. Raises an error of its state: it is in use, or gone."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class JobArchive:
+    """The jobs of a kind. unused : a block within which nothing else comes to need one; see `JobManager.delete`."""
+
+    manager: JobManager
+    kind: JobKind
+    folder: Path
+    unused: Callable[[UUID], AbstractContextManager[object]] = nullcontext
+
+    def kept(self) -> Sequence[Kept]:
+        """See `Archive`."""
+        return [
+            Kept(
+                each.id, each.label, each.created_at, each.finished_at or each.created_at,
+                each.state is JobState.SUCCEEDED, each.pinned,
+            )
+            for each in self.manager.store.finished(self.kind)
+        ]  # fmt: skip
+
+    def needed(self, old: Collection[UUID]) -> Collection[UUID]:  # noqa: ARG002
+        """See `Archive`; `remove` finds out."""
+        return ()
+
+    def place(self, item: UUID) -> Path:
+        """See `Archive`."""
+        return self.folder / str(item)
+
+    def remove(self, item: UUID, trash: Path) -> None:
+        """See `Archive`."""
+        self.manager.delete(item, self.unused(item), trash)
+
+
+class Retention:
+    """Removes what is beyond the limits, on a thread of its own, and empties the trash. Any thread may call.
+
+    Only what succeeded counts; what failed has a count of its own, and goes first. What is pinned, needed by something
+    else, or being read stays. A removal is on record in the audit.
+
+    archives : each with its limits.
     """
 
     def __init__(
         self,
-        store: JobStore,
-        kind: JobKind,
-        limits: Limits,
-        place: Callable[[UUID], Path],
-        delete: Callable[[UUID], None],
+        root: Path,
+        archives: Sequence[tuple[Archive, Limits]],
+        audit: Audit,
+        clock: SteadyClock,
         *,
-        clock: Clock = utc_now,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._store = store
-        self._kind = kind
-        self._limits = limits
-        self._place = place
-        self._delete = delete
+        self._trash = root / TRASH
+        self._archives: Mapping[str, tuple[Archive, Limits]] = {each.kind: (each, limits) for each, limits in archives}
+        self._audit = audit
         self._clock = clock
         self._now_s = now_s
         self._read_s: dict[UUID, float] = {}
-        self._due = threading.Event()
+        self._due = threading.Condition()
+        self._kinds = set(self._archives)
         self._closed = False
-        self._thread = threading.Thread(target=self._keep_on, name=f"slrig-{kind}-retention", daemon=True)
+        self._thread = threading.Thread(target=self._keep_on, name="slrig-retention", daemon=True)
 
     def start(self) -> None:
-        """Look now, after each `look`, and every hour. Does nothing without limits."""
-        if self._limits.any:
-            self._due.set()
+        """Look at all now and every hour, and at a kind after `look`. Does nothing without limits and trash."""
+        if self._trash.is_dir() or any(limits.any for _, limits in self._archives.values()):
             self._thread.start()
 
-    def look(self) -> None:
-        """Have the limits looked at soon. Returns at once."""
-        self._due.set()
+    def look(self, kind: str) -> None:
+        """Have the limits of a kind looked at soon. Returns at once."""
+        if kind in self._archives:
+            with self._due:
+                self._kinds.add(kind)
+                self._due.notify()
 
-    def reading(self, job_id: UUID) -> None:
-        """Take note that somebody asks for a file of a job."""
-        self._read_s[job_id] = self._now_s()
+    def reading(self, item: UUID) -> None:
+        """Take note that somebody asks for a file."""
+        self._read_s[item] = self._now_s()
 
     def close(self) -> None:
         """Look no more. Idempotent."""
-        self._closed = True
-        self._due.set()
+        with self._due:
+            self._closed = True
+            self._due.notify()
         if self._thread.is_alive():
             self._thread.join(_END_S)
 
     def _keep_on(self) -> None:
         while not self._closed:
-            self._due.wait(LOOK_S)
-            self._due.clear()
+            with self._due:
+                self._due.wait_for(lambda: self._closed or self._kinds, LOOK_S)
+                # After an hour without a job, all.
+                kinds, self._kinds = self._kinds or set(self._archives), set()
             if not self._closed:
                 try:
-                    self.apply()
+                    self.apply(kinds)
                 except Exception:  # noqa: BLE001 - a disk that refuses now may answer in an hour
-                    _log.exception("old jobs could not be looked for", kind=str(self._kind))
+                    _log.exception("what is old could not be looked for")
 
-    def apply(self) -> Sequence[UUID]:
-        """Remove what is beyond the limits, say so in the log, and return which."""
-        self._read_s = {job: at for job, at in self._read_s.items() if self._now_s() - at < READ_S}
+    def apply(self, kinds: Collection[str] | None = None) -> Sequence[UUID]:
+        """Remove what is beyond the limits of kinds, None for all, say so in log and audit, and return which."""
+        now = self._clock.now()
+        self._empty_trash()
+        self._read_s = {item: at_s for item, at_s in self._read_s.items() if self._now_s() - at_s < READ_S}
         removed = []
-        for record, why in list(self._beyond()):
-            if self._closed:
-                break
-            try:
-                self._delete(record.id)
-            except (JobNotFoundError, ScanStateError):
-                # Deleted by somebody meanwhile.
-                continue
-            except StorageError as error:
-                _log.warning("an old job could not be removed", job=str(record.id), cause=str(error))
-                continue
-            removed.append(record.id)
-            _log.info("old job removed", kind=str(self._kind), job=str(record.id), label=record.label, because=why)
+        for kind in self._archives if kinds is None else kinds:
+            archive, limits = self._archives[kind]
+            beyond = list(self._beyond(archive, limits, now)) if limits.any else []
+            needed = set(archive.needed([each.id for each, _ in beyond])) if beyond else set()
+            for old, why in beyond:
+                if not self._closed and old.id not in needed and self._removed(archive, old, why):
+                    removed.append(old.id)
         return removed
 
-    def _beyond(self) -> Iterator[tuple[JobRecord, str]]:
-        """The jobs to remove, and why: first those that failed, oldest first. Those that are kept whatever they are
-        count, too.
-        """
-        finished = self._store.finished(self._kind)
-        ended = _ends(finished)
-        now = self._clock() if self._limits.days is not None else None
+    def _removed(self, archive: Archive, old: Kept, why: str) -> bool:
+        try:
+            with disk_errors(self._trash):
+                self._trash.mkdir(exist_ok=True)
+            archive.remove(old.id, self._trash / f"{self._clock.ran_s:.0f}-{archive.kind}-{old.id}")
+        except (JobNotFoundError, ScanStateError, CalibrationNotFoundError, CalibrationStateError):
+            # Deleted by somebody meanwhile, or in use.
+            return False
+        except StorageError as error:
+            _log.warning("what is old could not be removed", kind=archive.kind, id=str(old.id), cause=str(error))
+            return False
+        _log.info("old one removed", kind=archive.kind, id=str(old.id), label=old.label, because=why)
+        self._audit.note(f"slrig: {why}", "", "DELETE", f"/{archive.kind}/{old.id}", 204, "")
+        return True
+
+    def _empty_trash(self) -> None:
+        """Remove what has lain in the trash for long enough: a folder's name begins with when it came, by `ran_s`."""
+        ran_s = self._clock.ran_s
+        for place in self._trash.iterdir() if self._trash.is_dir() else ():
+            since, _, name = place.name.partition("-")
+            if not since.isdecimal() or float(since) > ran_s:
+                # Somebody's own, or of a clock whose state was lost: its day begins now.
+                place.rename(self._trash / f"{ran_s:.0f}-{name or place.name}")
+            elif ran_s - float(since) > TRASH_S:
+                remove(place)
+
+    def _beyond(self, archive: Archive, limits: Limits, now: datetime) -> Iterator[tuple[Kept, str]]:
+        """What to remove, and why: first what failed, oldest first. What is kept whatever it is counts, too."""
+        kept = archive.kept()
+        ended = _ends(kept)
         size_bytes = 0
         found = []
         for succeeded in (True, False):
-            records = [each for each in finished if (each.state is JobState.SUCCEEDED) is succeeded]
-            for count, record in enumerate(records, 1):
-                if self._limits.size_bytes is not None:
-                    size_bytes += _size_bytes(self._place(record.id))
-                why = self._why(count, None if now is None else now - ended[record.id], size_bytes)
-                if why is not None and not record.pinned and record.id not in self._read_s:
-                    found.append((record, why))
+            for count, each in enumerate((each for each in kept if each.succeeded is succeeded), 1):
+                if limits.size_bytes is not None:
+                    size_bytes += _size_bytes(archive.place(each.id))
+                why = _why(limits, archive.kind, count, now - ended[each.id], size_bytes)
+                if why is not None and not each.pinned and each.id not in self._read_s:
+                    found.append((each, why))
         yield from reversed(found)
 
-    def _why(self, count: int, age: timedelta | None, size_bytes: int) -> str | None:
-        limits, setting = self._limits, f"keep_{self._kind}s"
-        if limits.count is not None and count > limits.count:
-            return f"{setting} = {limits.count}"
-        if limits.days is not None and age is not None and age > timedelta(days=limits.days):
-            return f"{setting}_days = {limits.days:g}"
-        if limits.size_bytes is not None and size_bytes > limits.size_bytes:
-            return f"{setting}_bytes = {limits.size_bytes}"
-        return None
+
+def _why(limits: Limits, kind: str, count: int, age: timedelta, size_bytes: int) -> str | None:
+    if limits.count is not None and count > limits.count:
+        return f"keep_{kind}s = {limits.count}"
+    if limits.days is not None and age > timedelta(days=limits.days):
+        return f"keep_{kind}s_days = {limits.days:g}"
+    if limits.size_bytes is not None and size_bytes > limits.size_bytes:
+        return f"keep_{kind}s_bytes = {limits.size_bytes}"
+    return None
 
 
-def _ends(finished: Sequence[JobRecord]) -> dict[UUID, datetime]:
-    """When jobs ended. A job that was begun later did not end before earlier ones were begun, whatever a clock said."""
+def _ends(kept: Sequence[Kept]) -> dict[UUID, datetime]:
+    """When each ended. One that was begun later did not end before earlier ones were begun, whatever a clock said."""
     ends: dict[UUID, datetime] = {}
     latest = None
-    for record in reversed(finished):
-        latest = max(record.created_at, latest or record.created_at)
-        ends[record.id] = max(record.finished_at or record.created_at, latest)
+    for each in reversed(kept):
+        latest = max(each.created_at, latest or each.created_at)
+        ends[each.id] = max(each.ended_at, latest)
     return ends
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,10 +12,9 @@ from uuid import UUID, uuid4
 
 import numpy as np
 import pytest
-from structlog.testing import capture_logs
 
 from slrig.bundle.calibration import read_calibration, write_calibration
-from slrig.calibrate.job import PoseJob, PoseRequest, Retention, named_by_scans
+from slrig.calibrate.job import CalibrationArchive, PoseJob, PoseRequest, named_by_scans
 from slrig.calibrate.store import CalibrationStore, SessionRecord, SessionState, session_readings, with_jobs
 from slrig.errors import (
     ArtefactNotReadyError,
@@ -28,6 +27,8 @@ from slrig.errors import (
     UnsupportedByDeviceError,
 )
 from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, read_record, write_record
+from slrig.jobs.retention import CLOCK, TRASH, Limits, Retention, SteadyClock
+from slrig.jobs.store import Audit
 from slrig.model import Size
 from tests.unit.calibrate.calibration_bench import PNG, CalibrationBench, tame_calibration
 from tests.unit.scan.fakes import WAIT_S
@@ -447,6 +448,13 @@ def a_scan(bench: CalibrationBench, *, report: object = None, bundle: UUID | Non
         shutil.copy(store.solve(bundle, 1) / "calibration.json", folder / "bundle" / "calibration.json")
 
 
+def kept(bench: CalibrationBench, count: int | None, named: Callable[[], set[str]] = set) -> Retention:
+    """A retention that keeps so many calibrations."""
+    archive = CalibrationArchive(bench.calibrations, bench.folder.scans, named)
+    clock = SteadyClock(bench.folder.root / CLOCK)
+    return Retention(bench.folder.root, [(archive, Limits(count))], Audit(bench.store.database), clock)
+
+
 def test_only_what_is_neither_new_nor_needed_is_removed(bench: CalibrationBench) -> None:
     in_report, twice, in_bundle, active, empty, unused, begun, newest = (
         *(bench.solved() for _ in range(4)), bench.session(), bench.solved(), bench.session(), bench.solved(),
@@ -461,41 +469,42 @@ def test_only_what_is_neither_new_nor_needed_is_removed(bench: CalibrationBench)
         a_scan(bench, report=nothing)
     places = [bench.calibrations.store.folder(each) for each in (empty, unused)]
     assert all(place.is_dir() for place in places)
-    assert Retention(bench.calibrations, bench.folder, keep=7)() == ()
-    assert Retention(bench.calibrations, bench.folder, keep=None)() == ()
-    with capture_logs() as log:
-        assert Retention(bench.calibrations, bench.folder, keep=1)() == (empty, unused)
-    told = [each["calibration"] for each in log if each["event"] == "old calibration removed"]
-    assert told == [str(empty), str(unused)]
+    assert kept(bench, 7).apply() == []
+    assert kept(bench, None).apply() == []
+    bench.calibrations.pin(unused, pinned=True)
+    assert kept(bench, 1).apply() == [empty]
+    bench.calibrations.pin(unused, pinned=False)
+    assert kept(bench, 1).apply() == [unused]
     assert not any(place.exists() for place in places)
+    # They lie in the trash, and come back by hand.
+    (trashed,) = (bench.folder.root / TRASH).glob(f"*-calibration-{unused}")
+    assert (trashed / "session.json").is_file()
     assert [record.id for record in bench.calibrations.latest()] == [newest, begun, active, in_bundle, twice, in_report]
-    assert Retention(bench.calibrations, bench.folder, keep=1)() == ()
+    assert kept(bench, 1).apply() == []
 
 
 def test_a_pose_under_way_keeps_its_session(bench: CalibrationBench) -> None:
     old = bench.session()
     bench.held_pose(old)
     bench.session()
-    tidy = Retention(bench.calibrations, bench.folder, keep=1)
-    assert tidy() == ()
+    assert kept(bench, 1).apply() == []
     bench.gate.set()
     bench.until_pose(old, 1)
-    assert tidy() == (old,)
+    assert kept(bench, 1).apply() == [old]
 
 
 def test_one_that_states_no_error_is_known_by_its_numbers(bench: CalibrationBench, tmp_path: Path) -> None:
     given = tmp_path / "given.json"
-    kept, gone = (tame_calibration(focal_px=focal) for focal in (80.0, 90.0))
+    needed, gone = (tame_calibration(focal_px=focal) for focal in (80.0, 90.0))
     imported = []
-    for each in (kept, gone):
+    for each in (needed, gone):
         write_calibration(given, each)
         document = json.loads(given.read_text())
         document.pop("solved")
         imported.append(bench.calibrations.submit(json.dumps(document).encode(), ".json").id)
     bench.solved()
-    a_scan(bench, report={"calibration": {"id": kept.digest}})
-    assert named_by_scans(bench.folder.scans) == {kept.digest}
-    tidy = Retention(bench.calibrations, bench.folder, keep=1, named=lambda: {gone.digest})
+    a_scan(bench, report={"calibration": {"id": needed.digest}})
+    assert named_by_scans(bench.folder.scans) == {needed.digest}
     # Others than scans name them too.
-    assert tidy() == ()
-    assert Retention(bench.calibrations, bench.folder, keep=1)() == (imported[1],)
+    assert kept(bench, 1, lambda: {gone.digest}).apply() == []
+    assert kept(bench, 1).apply() == [imported[1]]

@@ -3,35 +3,63 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import cast
 from uuid import UUID
 
 import pytest
 
+from slrig.api.server import KINDS
 from slrig.errors import StorageError
-from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.data_folder import DataFolder, write_entries
 from slrig.jobs.database import Database
-from slrig.jobs.records import JobKind, JobState
-from slrig.jobs.retention import DOUBT_S, READ_S, JobRetention, Limits, SteadyClock
-from slrig.jobs.store import JobStore
+from slrig.jobs.manager import JobManager
+from slrig.jobs.records import JobKind, JobState, write_record
+from slrig.jobs.resume import resume
+from slrig.jobs.retention import (
+    CLOCK,
+    DOUBT_S,
+    READ_S,
+    TRASH,
+    TRASH_S,
+    Archive,
+    JobArchive,
+    Limits,
+    Retention,
+    SteadyClock,
+)
+from slrig.jobs.store import Audit, JobStore
+from slrig.rig.session import RigSession
 from slrig.scan.job import plan_json
 from slrig.scan.plan import ScanPlan
+from tests.unit.jobs.tame_compute import TameCompute
+from tests.unit.scan.bench import PIPELINE
+from tests.unit.scan.fakes import never
 
 NOON = datetime(2026, 11, 23, 12, tzinfo=UTC)
 
 
-class Archive:
-    """Scans of a data folder, each an hour younger than the one before, of 1000 bytes."""
+class Scans:
+    """Scans of a data folder, each an hour younger than the one before, of 1000 bytes: an `Archive`."""
 
     def __init__(self, root: Path) -> None:
         self.now, self.now_s = NOON, 0.0
         self.folder = DataFolder(root)
         self.store = JobStore(Database(self.folder.database), clock=lambda: self.now)
-        self.steady = SteadyClock(root / "clock.json", clock=lambda: self.now, now_s=lambda: self.now_s)
-        self.deleted: list[UUID] = []
+        rig, worker = RigSession("bench", never), TameCompute(PIPELINE)
+        self.manager = JobManager(self.store, self.folder, rig, worker, *KINDS)
+        self.jobs = JobArchive(self.manager, JobKind.SCAN, self.folder.scans)
+        self.kind, self.kept, self.needed, self.place = "scan", self.jobs.kept, self.jobs.needed, self.jobs.place
+        self.audit = Audit(self.store.database, clock=lambda: self.now)
         self.refuses: set[UUID] = set()
+        self.removed = threading.Event()
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin with the clock's state as it is on disk."""
+        self.steady = SteadyClock(self.folder.root / CLOCK, clock=lambda: self.now, now_s=lambda: self.now_s)
 
     def scan(self, state: JobState = JobState.SUCCEEDED) -> UUID:
         self.now += timedelta(hours=1)
@@ -39,26 +67,25 @@ class Archive:
         if state.final:
             self.store.finish(made, state)
             self.folder.scan(made).mkdir()
-            (self.folder.scan(made) / "mesh.ply").write_bytes(bytes(1000))
+            (self.folder.scan(made) / "mesh.ply").write_bytes(bytes(998))
+            (self.folder.scan(made) / "report.json").write_bytes(b"{}")
         return made
 
-    def delete(self, scan: UUID) -> None:
-        if scan in self.refuses:
+    def remove(self, item: UUID, trash: Path) -> None:
+        if item in self.refuses:
             message = "read-only"
             raise StorageError(message)
-        self.store.delete(scan)
-        self.deleted.append(scan)
+        self.jobs.remove(item, trash)
+        self.removed.set()
 
-    def retention(self, limits: Limits, delete: Callable[[UUID], None] | None = None) -> JobRetention:
-        return JobRetention(
-            self.store, JobKind.SCAN, limits, self.folder.scan, delete or self.delete,
-            clock=self.steady.now, now_s=lambda: self.now_s,
-        )  # fmt: skip
+    def retention(self, limits: Limits) -> Retention:
+        archives = [(cast("Archive", self), limits)]
+        return Retention(self.folder.root, archives, self.audit, self.steady, now_s=lambda: self.now_s)
 
 
 @pytest.fixture
-def archive(tmp_path: Path) -> Iterator[Archive]:
-    found = Archive(tmp_path / "data")
+def archive(tmp_path: Path) -> Iterator[Scans]:
+    found = Scans(tmp_path / "data")
     yield found
     found.store.database.close()
     found.folder.release()
@@ -74,13 +101,13 @@ def archive(tmp_path: Path) -> Iterator[Archive]:
         (Limits(count=4, days=1.0, size_bytes=1000), 1),
     ],
 )
-def test_the_oldest_beyond_a_limit_are_removed(archive: Archive, limits: Limits, kept: int) -> None:
+def test_the_oldest_beyond_a_limit_are_removed(archive: Scans, limits: Limits, kept: int) -> None:
     made = [archive.scan() for _ in range(5)]
     assert list(archive.retention(limits).apply()) == made[: 5 - kept]
     assert archive.retention(limits).apply() == []
 
 
-def test_a_scan_that_is_pinned_under_way_or_being_read_is_kept(archive: Archive) -> None:
+def test_a_scan_that_is_pinned_under_way_or_being_read_is_kept(archive: Scans) -> None:
     pinned, under_way, read, old, new = (
         archive.scan(), archive.scan(JobState.CAPTURING), archive.scan(), archive.scan(), archive.scan(),
     )  # fmt: skip
@@ -95,7 +122,7 @@ def test_a_scan_that_is_pinned_under_way_or_being_read_is_kept(archive: Archive)
     assert {job.id for job in archive.store.page(before=None, limit=9)} == {under_way, new}
 
 
-def test_those_that_failed_push_out_none_that_succeeded_and_go_first(archive: Archive) -> None:
+def test_those_that_failed_push_out_none_that_succeeded_and_go_first(archive: Scans) -> None:
     good = [archive.scan() for _ in range(2)]
     failed = [archive.scan(state) for state in (JobState.FAILED, JobState.CANCELLED, JobState.INTERRUPTED)]
     assert archive.retention(Limits(count=2)).apply() == failed[:1]
@@ -108,10 +135,10 @@ EVERY_LIMIT = Limits(count=9, days=30.0, size_bytes=10**6)
 
 @pytest.mark.parametrize("restarts", [False, True])
 @pytest.mark.parametrize("years", [-10, 10])
-def test_a_clock_that_jumps_removes_nothing(archive: Archive, years: int, *, restarts: bool) -> None:
+def test_a_clock_that_jumps_removes_nothing(archive: Scans, years: int, *, restarts: bool) -> None:
     def look() -> None:
         if restarts:
-            archive.steady = SteadyClock(archive.steady._file, clock=lambda: archive.now, now_s=lambda: archive.now_s)
+            archive.restart()
         assert archive.retention(EVERY_LIMIT).apply() == []
 
     made = [archive.scan() for _ in range(3)]
@@ -131,7 +158,7 @@ def test_a_clock_that_jumps_removes_nothing(archive: Archive, years: int, *, res
     assert archive.store.finished(JobKind.SCAN)[0].id == made[-1]
 
 
-def test_time_that_a_rig_was_off_counts_once_it_has_run_for_a_week(archive: Archive) -> None:
+def test_time_that_a_rig_was_off_counts_once_it_has_run_for_a_week(archive: Scans) -> None:
     old = archive.scan()
     assert archive.retention(EVERY_LIMIT).apply() == []
     archive.now += timedelta(days=60)
@@ -146,36 +173,71 @@ def test_time_that_a_rig_was_off_counts_once_it_has_run_for_a_week(archive: Arch
     assert archive.retention(EVERY_LIMIT).apply() == [old]
 
 
-def test_a_clock_that_stands_or_a_damaged_state_of_it_removes_nothing(archive: Archive) -> None:
+def test_a_clock_that_stands_or_a_damaged_state_of_it_removes_nothing(archive: Scans) -> None:
     archive.scan()
     for _ in range(100):
         archive.now_s += 86400.0
         assert archive.retention(EVERY_LIMIT).apply() == []
-    archive.steady._file.write_bytes(b"{")
-    archive.steady = SteadyClock(archive.steady._file, clock=lambda: archive.now, now_s=lambda: archive.now_s)
+    (archive.folder.root / CLOCK).write_bytes(b"{")
+    archive.restart()
     assert archive.retention(EVERY_LIMIT).apply() == []
 
 
-def test_a_disk_that_refuses_one_keeps_that_one_only(archive: Archive) -> None:
+def test_a_disk_that_refuses_one_keeps_that_one_only(archive: Scans) -> None:
     first, second, _ = archive.scan(), archive.scan(), archive.scan()
     archive.refuses = {first}
     assert archive.retention(Limits(count=1)).apply() == [second]
 
 
-def test_it_looks_at_its_start_and_when_it_is_told_to(archive: Archive) -> None:
-    removed = threading.Event()
-
-    def delete(scan: UUID) -> None:
-        archive.delete(scan)
-        removed.set()
-
-    first, second = archive.scan(), archive.scan()
-    retention = archive.retention(Limits(count=1), delete)
+def test_it_looks_at_its_start_and_when_it_is_told_to(archive: Scans) -> None:
+    made = [archive.scan() for _ in range(2)]
+    retention = archive.retention(Limits(count=1))
     retention.start()
-    assert removed.wait(30)
-    removed.clear()
-    archive.scan()
-    retention.look()
-    assert removed.wait(30)
+    assert archive.removed.wait(30)
+    archive.removed.clear()
+    made.append(archive.scan())
+    retention.look("scan")
+    assert archive.removed.wait(30)
     retention.close()
-    assert archive.deleted == [first, second]
+    assert [each.id for each in archive.store.finished()] == made[2:]
+
+
+def test_what_is_removed_lies_in_the_trash_for_a_day_of_the_service_and_comes_back_by_hand(archive: Scans) -> None:
+    first, second, last = (archive.scan() for _ in range(3))
+    for scan in (first, second):
+        write_record(archive.folder.scan(scan), archive.store.get(scan))
+        write_entries(archive.folder.scan(scan))
+    retention = archive.retention(Limits(count=1))
+    assert retention.apply() == [first, second]
+    assert [(each.who, each.method, each.path, each.status) for each in archive.audit.page(before=None, limit=9)] == [
+        ("slrig: keep_scans = 1", "DELETE", f"/scan/{scan}", 204) for scan in (second, first)
+    ]
+    trash = archive.folder.root / TRASH
+    # A system clock that jumps is no day of the service, nor is one that it was off.
+    archive.now += timedelta(days=3650)
+    archive.restart()
+    assert archive.retention(Limits(count=1)).apply() == []
+    assert sorted(place.name.split("-", 2)[2] for place in trash.iterdir()) == sorted(map(str, (first, second)))
+    (place,) = trash.glob(f"*-scan-{first}")
+    place.rename(archive.folder.scan(first))
+    resume(archive.manager)
+    back = archive.store.get(first)
+    assert (back.state, back.pinned) == (JobState.SUCCEEDED, True)
+    (trash / "somebody's").mkdir()
+    for seconds, left in ((TRASH_S / 2, 2), (TRASH_S / 2 + 1, 1), (TRASH_S / 2, 0)):
+        archive.now_s += seconds
+        assert archive.retention(Limits(count=9)).apply() == []
+        assert len(list(trash.iterdir())) == left
+    assert {each.id for each in archive.store.finished()} == {first, last}
+
+
+def test_trash_of_a_clock_whose_state_was_lost_is_kept_for_a_day_more(archive: Scans) -> None:
+    archive.scan(), archive.scan()
+    archive.now_s += 10 * TRASH_S
+    archive.retention(Limits(count=1)).apply()
+    (archive.folder.root / CLOCK).unlink()
+    archive.restart()
+    for seconds, left in ((0.0, 1), (TRASH_S - 1, 1), (2.0, 0)):
+        archive.now_s += seconds
+        archive.retention(Limits(count=9)).apply()
+        assert len(list((archive.folder.root / TRASH).iterdir())) == left

@@ -31,9 +31,10 @@ from slrig.jobs.data_folder import FILES
 from slrig.jobs.job import Recording
 from slrig.jobs.records import RECORD, JobKind, JobProgress, JobRecord, JobState, utc_now, write_record
 from slrig.jobs.resume import resume
-from slrig.jobs.retention import JobRetention, Limits
+from slrig.jobs.retention import CLOCK, JobArchive, Limits, Retention, SteadyClock
+from slrig.jobs.store import Audit
 from slrig.model import MeasuredAxis, PlaneKind, TurntablePlane
-from slrig.model_jobs.job import ViewShooting
+from slrig.model_jobs.job import MODELS, ViewShooting
 from slrig.model_jobs.plan import (
     MEDIA_TYPES,
     MODEL,
@@ -150,9 +151,15 @@ def test_what_cannot_be_made_is_refused_before_it_is_on_record(bench: ModelBench
     assert bench.store.states(JobKind.MODEL) == {}
 
 
+def kept(bench: ModelBench, archive: JobArchive) -> Retention:
+    """A retention that keeps one."""
+    clock = SteadyClock(bench.folder.root / CLOCK)
+    return Retention(bench.folder.root, [(archive, Limits(count=1))], Audit(bench.store.database), clock)
+
+
 def test_scans_that_a_model_needs_stay_until_it_is_over(bench: ModelBench) -> None:
     scans = bench.kept_scans(0.0, 40.0)
-    retention = JobRetention(bench.store, JobKind.SCAN, Limits(count=1), bench.folder.scan, bench.delete_scan)
+    retention = kept(bench, JobArchive(bench.manager, JobKind.SCAN, bench.folder.scans, bench.models.unused))
     bench.tame.gate.clear()
     plan = ModelPlan(scans, TurntablePoses(AXIS))
     models = [bench.models.combine(plan) for _ in range(2)]
@@ -174,7 +181,7 @@ def test_models_beyond_the_limit_go_with_their_files(bench: ModelBench) -> None:
     plan = ModelPlan(bench.kept_scans(0.0, 40.0), TurntablePoses(AXIS))
     made = [bench.over(bench.models.combine(plan).id).id for _ in range(3)]
     bench.store.pin(made[0], JobKind.MODEL, pinned=True)
-    retention = JobRetention(bench.store, JobKind.MODEL, Limits(count=1), bench.models.place, bench.manager.delete)
+    retention = kept(bench, JobArchive(bench.manager, JobKind.MODEL, bench.folder.root / MODELS))
     assert retention.apply() == [made[1]]
     assert {each.name for each in bench.models.place(made[0]).parent.iterdir()} == {str(made[0]), str(made[2])}
 
