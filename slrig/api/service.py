@@ -180,7 +180,10 @@ class Service:
         self._lasting: frozenset[str] = frozenset()
         database, outbox = self.store.database, self.store.outbox
         self.senders = senders_of(settings, outbox)
-        self.keys = RequestKeys(database, life_s=settings.idempotency_keep_s)
+        newest = self.store.page(JobKind.SCAN, before=None, limit=1)
+        clock = SteadyClock(self.folder.root / CLOCK, first=newest[0].created_at if newest else None)
+        outbox.clock = clock.now
+        self.keys = RequestKeys(database, clock=clock.now, life_s=settings.idempotency_keep_s)
         self.keys.release_all()
         self.audit = Audit(database)
         self.calibrations = Calibrations(manager, tolerance_mm=tolerance_mm)
@@ -202,7 +205,6 @@ class Service:
         self.store.after_end = self._ended
         self.copier = self._copier()
         self._tellers = (*self.senders, *(() if self.copier is None else (self.copier,)))
-        newest = self.store.page(JobKind.SCAN, before=None, limit=1)
         self.retention = Retention(
             self.folder.root,
             [
@@ -221,7 +223,7 @@ class Service:
                 ),
             ],
             self.audit,
-            SteadyClock(self.folder.root / CLOCK, first=newest[0].created_at if newest else None),
+            clock,
         )
         self.schedules = ScheduleStore(database, notice=partial(tell_run, outbox))
         self.tasks = Tasks(

@@ -6,10 +6,11 @@ DATA/.trash/SECOND-KIND-ID    what was removed less than a day of the service ag
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -52,6 +53,9 @@ DOUBT_S = 7 * 86400.0
 TRASH, TRASH_S = ".trash", 86400.0
 """Where what was removed lies in the data folder, and for how many seconds in which the service runs."""
 
+_WRITE_S = 60.0
+"""How often the state of a clock is written at most, while nothing is doubted."""
+
 _END_S = 1.0
 """How long the end of the service waits for a removal under way; the next start completes one that is cut off."""
 
@@ -85,8 +89,8 @@ class _ClockState(BaseModel, extra="forbid"):
 class SteadyClock:
     """A clock for what cannot be undone: one wrong reading of the system's clock does not move it.
 
-    It follows the system's clock. Where that jumps by more than `MAX_JUMP`, while the service runs or between two
-    runs, it goes on from where it was by the monotonic clock, until the service has run for `DOUBT_S` with the new
+    Any thread may call. It follows the system's clock. Where that jumps by more than `MAX_JUMP`, while the service runs
+    or between two runs, it goes on from where it was by the monotonic clock, until the service has run for `DOUBT_S` with the new
     time. file : keeps its state over restarts. first : the time to begin with where there is no such file.
     """
 
@@ -102,13 +106,19 @@ class SteadyClock:
         self._clock = clock
         self._now_s = now_s
         self._at_s = now_s()
+        self._written_s = -math.inf
+        self._lock = threading.Lock()
         try:
             self._state = _ClockState.model_validate_json(file.read_bytes())
         except (OSError, ValidationError):
             self._state = _ClockState(time=first or clock(), doubt_s=0.0)
 
     def now(self) -> datetime:
-        """The time, never later than the system's. Raises StorageError."""
+        """The time, never later than the system's."""
+        with self._lock:
+            return self._now()
+
+    def _now(self) -> datetime:
         wall, at_s = self._clock(), self._now_s()
         elapsed_s, self._at_s = at_s - self._at_s, at_s
         expected = self._state.time + timedelta(seconds=elapsed_s)
@@ -122,12 +132,19 @@ class SteadyClock:
                 )
             doubt_s = self._state.doubt_s + max(elapsed_s, 1e-3)
         believed = doubt_s == 0.0 or doubt_s >= DOUBT_S
-        self._state = _ClockState(
-            time=wall if believed else expected,
-            doubt_s=0.0 if believed else doubt_s,
-            ran_s=self._state.ran_s + max(elapsed_s, 0.0),
+        before, self._state = (
+            self._state,
+            _ClockState(
+                time=wall if believed else expected,
+                doubt_s=0.0 if believed else doubt_s,
+                ran_s=self._state.ran_s + max(elapsed_s, 0.0),
+            ),
         )
-        write_file(self._file, self._state.model_dump_json().encode())
+        if at_s - self._written_s > _WRITE_S or (before.doubt_s > 0.0) != (self._state.doubt_s > 0.0):
+            # After one that the disk refused, the next start doubts a little more.
+            with suppress(StorageError):
+                write_file(self._file, self._state.model_dump_json().encode())
+                self._written_s = at_s
         return min(wall, self._state.time)
 
     @property

@@ -154,7 +154,8 @@ class Outbox:
 
     rig : the name that notices bear. wanted : the kinds that each receiver wants, by its name; all others are let go.
     most : may wait for one; the oldest make room. `news` is set when one more waits, `dropped` counts those that were
-    never sent. copies : takes every job that ends, for a catalogue; None where there is none.
+    never sent. clock : for their ages, which a jump of the system's clock must not change. copies : takes every job
+    that ends, for a catalogue; None where there is none.
     """
 
     def __init__(
@@ -170,7 +171,7 @@ class Outbox:
         self.database = database
         self._rig = rig
         self._wanted = wanted or {}
-        self._clock = clock
+        self.clock = clock
         self._most = most
         self.news = {receiver: threading.Event() for receiver in self._wanted}
         self.dropped = 0
@@ -178,10 +179,10 @@ class Outbox:
 
     def put(self, session: Session, kind: NoticeKind, words: str, /, **members: Mapping[str, Any]) -> None:
         """Have a notice sent once the session's changes are kept. words : what it says to people, but for the rig."""
-        notice_id, at = f"msg_{uuid4().hex}", stamp(self._clock())
+        notice_id, at = f"msg_{uuid4().hex}", stamp(self.clock())
         body = {"id": notice_id, "kind": kind, "at": at, "rig": self._rig, "words": f"rig '{self._rig}': {words}"}
         # Those of receivers that are no longer in the settings wait for as long, in case these come back.
-        old = NoticeRow.at < stamp(self._clock() - KEPT_FOR)
+        old = NoticeRow.at < stamp(self.clock() - KEPT_FOR)
         session.execute(delete(NoticeRow).where(NoticeRow.receiver.not_in(self._wanted), old))
         for receiver in (name for name, kinds in self._wanted.items() if kind in kinds):
             session.add(NoticeRow(receiver=receiver, id=notice_id, at=at, kind=kind, body={**body, **members}))
@@ -215,7 +216,7 @@ class Outbox:
                 row = session.scalar(waiting.order_by(NoticeRow.number).limit(1))
             if row is None:
                 return None
-            limit = stamp(self._clock() - KEPT_FOR)
+            limit = stamp(self.clock() - KEPT_FOR)
             if row.at >= limit:
                 return Notice(row.number, row.id, row.body)
             with self.database.changing() as session:
@@ -234,7 +235,7 @@ class Outbox:
             count, oldest = session.execute(query).one()
         if count == 0:
             return 0, 0.0
-        return count, max((self._clock() - datetime.fromisoformat(oldest)).total_seconds(), 0.0)
+        return count, max((self.clock() - datetime.fromisoformat(oldest)).total_seconds(), 0.0)
 
     def _drop(self, session: Session, receiver: str, which: ColumnElement[bool], cause: str) -> None:
         query = delete(NoticeRow).where(NoticeRow.receiver == receiver, which).returning(NoticeRow.id)

@@ -30,7 +30,7 @@ from slrig.jobs.retention import (
     Retention,
     SteadyClock,
 )
-from slrig.jobs.store import Audit, JobStore
+from slrig.jobs.store import Audit, JobStore, Outbox, RequestKeys
 from slrig.rig.session import RigSession
 from slrig.scan.job import plan_json
 from slrig.scan.plan import ScanPlan
@@ -156,6 +156,22 @@ def test_a_clock_that_jumps_removes_nothing(archive: Scans, years: int, *, resta
         archive.now += timedelta(days=1)
         look()
     assert archive.store.finished(JobKind.SCAN)[0].id == made[-1]
+
+
+@pytest.mark.parametrize("years", [-10, 10])
+def test_notices_and_keys_of_requests_outlive_a_clock_that_jumps(archive: Scans, years: int) -> None:
+    clock, scan = archive.steady.now, archive.scan()
+    outbox = Outbox(archive.store.database, wanted={"webhook": ["job.ended"]}, clock=clock)
+    keys = RequestKeys(archive.store.database, clock=clock)
+    keys.reserve("mine", "fingerprint")
+    keys.tie("mine", scan)
+    with archive.store.database.changing() as session:
+        outbox.ended(session, archive.store.get(scan))
+    for _ in range(2):
+        archive.now += timedelta(days=365 * years)
+        assert outbox.oldest("webhook") is not None
+        assert keys.reserve("mine", "fingerprint") == scan
+        years = -years
 
 
 def test_time_that_a_rig_was_off_counts_once_it_has_run_for_a_week(archive: Scans) -> None:
