@@ -90,8 +90,8 @@ class SteadyClock:
     """A clock for what cannot be undone: one wrong reading of the system's clock does not move it.
 
     Any thread may call. It follows the system's clock. Where that jumps by more than `MAX_JUMP`, while the service runs
-    or between two runs, it goes on from where it was by the monotonic clock, until the service has run for `DOUBT_S` with the new
-    time. file : keeps its state over restarts. first : the time to begin with where there is no such file.
+    or between two runs, it goes on from where it was by the monotonic clock, until the service has run for `DOUBT_S`
+    with the new time. file : keeps its state over restarts. first : the time to begin with where there is no such file.
     """
 
     def __init__(
