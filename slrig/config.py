@@ -264,11 +264,11 @@ class ServiceSettings(BaseSettings):
     rig: Path | None = None
     require_key: bool = True
     allowed_hosts: Annotated[tuple[str, ...], NoDecode] = ()
-    queue_length: Annotated[int, Field(ge=0, le=1000)] = 8
+    queue_length: Annotated[int, Field(ge=0, le=1000)] = 16
     backlog_length: Annotated[int, Field(ge=1, le=1000)] = 16
     max_body_bytes: Annotated[int, Field(ge=1024)] = 2**16
     min_free_bytes: Annotated[int, Field(ge=0)] = 2**30
-    # For twenty viewers of the page, who have two each: pictures, and events.
+    # Pictures, events and bundles: half of them for one key.
     max_event_streams: Annotated[int, Field(ge=1)] = 48
     requests_per_s: Annotated[float, Field(gt=0)] = 50.0
     max_connections: Annotated[int, Field(ge=16, le=1536)] = 512

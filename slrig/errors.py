@@ -146,7 +146,7 @@ class RigBusyError(SlrigError, code="rig-busy"):
 
 
 class QueueFullError(SlrigError, code="queue-full"):
-    """The rig is held, and the queue has as many scans as it may have."""
+    """The line has as many jobs as it may have, or as many of one key. Try again later."""
 
 
 class ScanCancelledError(SlrigError, code="scan-cancelled"):

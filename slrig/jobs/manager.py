@@ -26,7 +26,6 @@ from slrig.errors import (
     DeviceError,
     InvalidInputError,
     JobNotFoundError,
-    QueueFullError,
     RigBusyError,
     ScanCancelledError,
     ScanInterruptedError,
@@ -46,6 +45,7 @@ from slrig.jobs.records import (
     acting_as,
     holder_of,
     read_record,
+    require_share,
     utc_now,
     write_record,
 )
@@ -99,7 +99,7 @@ class RigStatus:
 class _Work:
     """A job that waits or is under way. Its first end stands.
 
-    captured : its frames are taken, and what is left is to compute. resumable : whether the next start of the service
+    by : who asked for it. captured : its frames are taken, and it is to compute. resumable : whether the next start
     goes on with it. stop : set when it is to end early. error : by which it ended, once `ended`. outcome : what it
     found. worked : nothing of it is under way any more. dismissed : its group knows that it came to nothing.
     """
@@ -109,6 +109,7 @@ class _Work:
     holder: Holder
     since: datetime
     due_s: float = -math.inf
+    by: str | None = None
     captured: bool = False
     resumable: bool = True
     stop: threading.Event = field(default_factory=threading.Event)
@@ -472,7 +473,8 @@ class JobManager:
     # The line
 
     def _work(self, job: Job, record: JobRecord, holder: Holder | None, *, captured: bool = False) -> _Work:
-        return _Work(record.id, job, holder or holder_of(record), record.created_at, due_s(job), captured)
+        by = record.requested_by
+        return _Work(record.id, job, holder or holder_of(record), record.created_at, due_s(job), by, captured)
 
     def _line_up(self, works: Iterable[_Work]) -> None:
         """Put jobs where they wait for the rig, or compute; with the lock held."""
@@ -494,9 +496,8 @@ class JobManager:
         ahead = self._active or (waiting[0] if waiting else None)
         if ahead is not None and not wait:
             raise _busy(ahead)
-        if len(waiting) >= self.queue_length and ahead is not None:
-            message = f"The rig is held and {len(waiting)} are waiting, as many as may. Try again later."
-            raise QueueFullError(message)
+        if ahead is not None:
+            require_share("in the line for the rig", self.queue_length, [work.by for work in waiting])
 
     def _refuse_while_stuck(self) -> None:
         call = self.rig.calls.stuck
@@ -738,7 +739,7 @@ class JobManager:
         group = self.groups.get(work.job.kind)
         if group is None:
             return outcome
-        with acting_as(self.store.get(work.id).requested_by):
+        with acting_as(work.by):
             return group.ended(work.job, work.id, outcome)
 
     def _run_of(self, work: _Work, progress: ProgressRecorder) -> JobRun:
@@ -767,7 +768,7 @@ class JobManager:
         """Have those jobs done that follow one whose frames are taken."""
         group = self.groups.get(work.job.kind)
         if group is not None:
-            with _unharmed(work), acting_as(self.store.get(work.id).requested_by):
+            with _unharmed(work), acting_as(work.by):
                 group.captured(work.job, work.id)
 
     def _on_record_as_computing(self, work: _Work) -> bool:

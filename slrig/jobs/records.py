@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
@@ -16,6 +16,7 @@ from uuid import UUID
 from pydantic import TypeAdapter, ValidationError
 
 from slrig.bundle import write_file
+from slrig.errors import QueueFullError
 from slrig.failure import JobFailure
 
 RECORD = "record.json"
@@ -55,6 +56,35 @@ def actor_key() -> str:
 def actor() -> str | None:
     """Who asks for what is being made now."""
     return _actor.get()
+
+
+ANYONE = "anyone"
+"""Who asks a service that asks nobody for a key."""
+
+
+def has_share(total: int, who: str | None, holders: Collection[str | None]) -> bool:
+    """Whether a name may have one more of so many places, which `holders` have: while it has fewer than are free.
+
+    However many n greedy names leave one place in n + 1 free for the next (Choudhury and Hahne, Dynamic queue length
+    thresholds for shared-memory packet switches, 1998). Names are unique among keys that are good. Who has none is
+    held to the total alone.
+
+    >>> [has_share(4, "ann", ["ann"] * n) for n in (1, 2)], has_share(4, "bob", ["ann"] * 2)
+    ([True, False], True)
+    """
+    own = 0 if who in {None, ANYONE} else sum(each == who for each in holders)
+    return total - len(holders) > own
+
+
+def require_share(what: str, total: int, holders: Collection[str | None]) -> None:
+    """Raise QueueFullError unless whoever asks now may have one more of so many places of a line."""
+    if not has_share(total, actor(), holders):
+        own = sum(each == actor() for each in holders)
+        message = (
+            f"{len(holders)} of {total} places {what} are taken, {own} of them by you, and nobody gets more than are "
+            "left for all others. Try again later."
+        )
+        raise QueueFullError(message)
 
 
 class JobKind(StrEnum):

@@ -19,7 +19,6 @@ from slrig.errors import (
     DeviceError,
     DriverBrokenError,
     JobNotFoundError,
-    QueueFullError,
     ScanCancelledError,
     ScanStateError,
     SlrigError,
@@ -31,7 +30,7 @@ from slrig.failure import errors_by_code, job_failure
 from slrig.jobs.data_folder import BUNDLE, SCANS, DataFolder, require_whole
 from slrig.jobs.job import Job, JobRun, Outcome
 from slrig.jobs.manager import JobManager
-from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, acting_as, utc_now
+from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, acting_as, require_share, utc_now
 from slrig.model import MeasuredAxis, TurntablePlane
 from slrig.model_jobs.plan import (
     MEDIA_TYPES,
@@ -223,9 +222,7 @@ class Models:
             unfinished = self.jobs.unfinished(JobKind.MODEL)
             waiting = [each for each in unfinished if not plan_from_json(each.plan).being_shot]
             most = self._manager.backlog_length
-            if len(waiting) >= most:
-                message = f"{most} models are made or wait for that, as many as may. Try again later."
-                raise QueueFullError(message)
+            require_share("for models", most, [each.requested_by for each in waiting])
             self._require_space(used)
             record = self._manager.submit(ModelJob(used), label=label, key=key)[0]
         return self.jobs.get(record.id)

@@ -132,7 +132,7 @@ def test_settings_are_closed_by_default(monkeypatch: pytest.MonkeyPatch, tmp_pat
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     settings = read_settings()
     assert (settings.host, settings.port, settings.require_key) == ("127.0.0.1", 8731, True)
-    assert settings.queue_length == 8
+    assert settings.queue_length == 16
     assert settings.data_dir == tmp_path / "slrig"
     assert settings.key_path.parent == settings.data_dir
 

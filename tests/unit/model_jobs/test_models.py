@@ -163,7 +163,7 @@ def test_scans_that_a_model_needs_stay_until_it_is_over(bench: ModelBench) -> No
     bench.tame.gate.clear()
     plan = ModelPlan(scans, TurntablePoses(AXIS))
     models = [bench.models.combine(plan) for _ in range(2)]
-    with pytest.raises(QueueFullError, match="2 models are made"):
+    with pytest.raises(QueueFullError, match="2 of 2 places for models"):
         bench.models.combine(plan)
     with pytest.raises(ScanStateError, match=f"needed by model {models[0].id}"):
         bench.delete_scan(scans[0])
