@@ -213,3 +213,10 @@ def test_a_body_is_refused_by_the_service_which_says_why(proxied: Proxied) -> No
             answer = http.post("/calibration/import", content=body, headers=headers)
             assert answer.status_code in status, answer.text
             assert json.loads(answer.text)["type"].startswith("/problems/")
+
+
+@pytest.mark.parametrize("proxied", [nginx], indirect=True)
+def test_strangers_have_a_rate_at_nginx_and_keys_have_their_own(proxied: Proxied) -> None:
+    with proxied.http() as http:
+        assert any(http.get("/livez").status_code == 429 for _ in range(2000))
+        assert {http.get("/scan", headers=WITH_KEY).status_code for _ in range(20)} == {200}
