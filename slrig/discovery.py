@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import math
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -150,11 +149,10 @@ _FRESH_S = 5.0
 
 
 class DeviceSearch:
-    """The search for devices, which touches hardware: one at a time, whose result all get who wait for it."""
+    """The search for devices, which touches hardware. Whoever calls sees to it that one is made at a time."""
 
     def __init__(self, *, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s = now_s
-        self._lock = threading.Lock()
         self._found: DiscoveredDevices | None = None
         self._found_s = -math.inf
 
@@ -172,13 +170,10 @@ class DeviceSearch:
                 raise RigBusyError(message, holder=holder, since="")
             return self._found
         asked_s = self._now_s()
-        with self._lock:
-            # One that was begun after this request, or a moment before it, is its search, too.
-            if self._found is None or asked_s - self._found_s > _FRESH_S:
-                begun_s = self._now_s()
-                self._found = discover_devices()
-                self._found_s = begun_s
-            return self._found
+        if self._found is None or asked_s - self._found_s > _FRESH_S:
+            self._found = discover_devices()
+            self._found_s = asked_s
+        return self._found
 
 
 def open_rig(config: RigConfig) -> Rig:

@@ -9,7 +9,8 @@ from contextlib import asynccontextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
-from fastapi import APIRouter, FastAPI, Response
+from anyio.to_thread import current_default_thread_limiter
+from fastapi import APIRouter, Depends, FastAPI, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse
 from fastapi.routing import iter_route_contexts
@@ -21,9 +22,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from slrig.api import acceptance, auth, calibration, events, files, models, rig, scans, schedules, system
 from slrig.api.auth import LOCAL_NAMES, Access, BodyLimits, KeyRing, SecurityHeaders, Sessions
 from slrig.api.calibration import IMPORT_PATH, MOST_IMPORT_BYTES
-from slrig.api.events import OpenStreams
 from slrig.api.problems import PlainErrorsToProblems, answer, describe, install_problems, problem
-from slrig.api.service import Latency, Service
+from slrig.api.service import Latency, Service, turn
 
 _STREAMS = ("text/event-stream", "multipart/x-mixed-replace")
 """Answers that last: GET opens a stream, and light may move for it. HEAD is refused there."""
@@ -113,6 +113,7 @@ def bare_app() -> FastAPI:
         redoc_url=None,
         generate_unique_id_function=lambda route: route.name,
         lifespan=_life,
+        dependencies=[Depends(turn, scope="function")],
     )
     for part in (
         scans.router,
@@ -149,7 +150,6 @@ def create_app(service: Service, *, ring: KeyRing | None, cookie: str = "slrig_s
     settings = service.settings
     app = bare_app()
     app.state.service = service
-    app.state.streams = OpenStreams(settings.max_event_streams)
     app.state.sessions = None if ring is None else Sessions(ring, cookie=cookie)
     # The last one added is the outermost: every refusal becomes a problem, Host comes first, then page and key, then
     # the body's size. FastAPI's own size limit would lie outside of all of them and answer in plain text.
@@ -173,6 +173,8 @@ def create_app(service: Service, *, ring: KeyRing | None, cookie: str = "slrig_s
 @asynccontextmanager
 async def _life(app: FastAPI) -> AsyncIterator[None]:
     service: Service = app.state.service
+    # One for each connection: shares say how many answers are made at once, and nobody waits for another one's thread.
+    current_default_thread_limiter().total_tokens = service.settings.max_connections
     service.start()
     try:
         yield

@@ -7,7 +7,7 @@ import hashlib
 import re
 import secrets
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -17,6 +17,7 @@ from typing import Annotated, Literal
 from urllib.parse import urlsplit
 
 import structlog
+from anyio import CancelScope
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse
@@ -32,11 +33,12 @@ from slrig import KEY_VARIABLE
 from slrig.api.calibration import IMPORT_PATH
 from slrig.api.problems import answer, problem, problems
 from slrig.api.scopes import READING, KeyScope, moves, needed_scope
+from slrig.api.shares import Shares
 from slrig.api.system import FILES_PATH
 from slrig.bundle import Strict, write_file
 from slrig.errors import ConfigError, StorageError
 from slrig.failure import disk_errors
-from slrig.jobs.records import Clock, acting_as, utc_now
+from slrig.jobs.records import ANYONE, Clock, acting_as, utc_now
 from slrig.jobs.store import Audit
 
 LEAST_KEY_LENGTH = 16
@@ -237,9 +239,6 @@ SESSION_LIFE = timedelta(hours=12)
 """A working day."""
 LINK_LIFE = timedelta(minutes=15)
 MOST_SESSIONS = 256
-"""Of all keys together."""
-MOST_OF_KEY = 16
-"""Sessions of one key: a person with a few browsers."""
 
 router = APIRouter(prefix="/session", tags=["session"])
 
@@ -261,7 +260,8 @@ class Sessions:
         # Cookies do not tell ports apart: two services of one machine need two names.
         self.cookie = cookie
         self._clock = clock
-        self._open: OrderedDict[str, Session] = OrderedDict()
+        self._open: dict[str, Session] = {}
+        self._shares = Shares("sessions", MOST_SESSIONS, "Log out in a browser that is not used.", retry_s=60)
         self._links: dict[str, Session] = {}
 
     def link(self, name: str) -> str:
@@ -272,27 +272,23 @@ class Sessions:
 
     def follow(self, secret: str) -> tuple[str, Session] | None:
         """Open the session of a link, once; None where it was followed before, is too old, or its key has ended."""
-        link, now = self._links.pop(digest(secret), None), self._clock()
-        key = None if link is None or link.expires_at <= now else self.ring.by_digest(link.key)
-        return None if key is None or key.fault(now) is not None else self.open(key.name, key.digest)
+        link = self._links.pop(digest(secret), None)
+        return None if link is None or not self._good(link, self._clock()) else self.open(link.name, link.key)
 
     def open(self, name: str, key: str) -> tuple[str, Session]:
-        """Open a session by a key: the secret for the cookie, and the session. A key has `MOST_OF_KEY` of them at once;
-        its oldest ends for another one.
-
-        Raises
-        ------
-        Refused
-            As many sessions are open as may, of all keys together.
+        """Open a session by a key: the secret for the cookie, and the session. Where the key has its share of them, its
+        oldest ends for this one. Raises HTTPException 429: it has none, and others have all.
         """
         now = self._clock()
-        self._open = OrderedDict((each, session) for each, session in self._open.items() if session.expires_at > now)
-        own = [each for each, session in self._open.items() if session.key == key]
-        for each in own[: max(len(own) - MOST_OF_KEY + 1, 0)]:
-            del self._open[each]
-        if len(self._open) >= MOST_SESSIONS:
-            detail = f"{len(self._open)} browsers are logged in, as many as may. Log out in one that is not used."
-            raise Refused(429, "too-many-requests", detail, {"Retry-After": "60"})
+        # In their order, and without those of keys that have ended.
+        self._open = {each: session for each, session in self._open.items() if self._good(session, now)}
+        try:
+            self._shares.require(name, Counter(session.name for session in self._open.values()))
+        except HTTPException:
+            oldest = next((each for each, session in self._open.items() if session.key == key), None)
+            if oldest is None:
+                raise
+            del self._open[oldest]
         secret = secrets.token_urlsafe(32)
         session = Session(name, key, now + SESSION_LIFE)
         self._open[digest(secret)] = session
@@ -302,6 +298,10 @@ class Sessions:
         """The session that a cookie stands for."""
         found = self._open.get(digest(secret))
         return found if found is not None and found.expires_at > self._clock() else None
+
+    def _good(self, session: Session, now: datetime) -> bool:
+        key = self.ring.by_digest(session.key)
+        return session.expires_at > now and key is not None and key.fault(now) is None
 
     def close(self, secret: str) -> None:
         """Log out. Idempotent."""
@@ -330,10 +330,7 @@ async def open_session(request: Request, response: Response) -> SessionBody:
     sessions: Sessions | None = request.app.state.sessions
     if sessions is None:
         raise HTTPException(409, "This service asks nobody for a key, so there is nothing to log in to.")
-    try:
-        secret, session = sessions.open(caller.name, caller.key)
-    except Refused as refusal:
-        raise HTTPException(refusal.status, str(refusal), refusal.headers) from refusal
+    secret, session = sessions.open(caller.name, caller.key)
     _set_cookie(request, response, sessions, secret)
     return SessionBody(name=caller.name, scopes=caller.scopes, expires_at=session.expires_at)
 
@@ -382,12 +379,10 @@ def _set_cookie(request: Request, response: Response, sessions: Sessions, secret
     )
 
 
-OPEN_PATHS = frozenset({"/", "/livez", "/readyz", LINK_PATH})
+PROBES = frozenset({"/livez", "/readyz"})
+OPEN_PATHS = frozenset({"/", *PROBES, LINK_PATH})
 """What answers without a key: the page, which asks for one, probes, which tell nothing about scans, and the link that
 stands for a key."""
-
-ANYONE = "anyone"
-"""Who sends requests to a service that asks for no key."""
 
 _NAVIGATED = "navigate"
 _JSON_TYPES = frozenset({"application/json", "application/problem+json"})
@@ -447,40 +442,49 @@ class Access:
             refuse_foreign_page(headers, method, path, by_cookie=not by_key and "cookie" in headers)
             refuse_other_types(headers, method, path)
             caller = self._caller(headers, path)
-            if caller is None:
-                self._rates.count(address, address)
-            else:
-                self._rates.count(caller.key, caller.name)
             if caller is not None:
+                self._rates.count(caller.key, caller.name)
                 refuse_out_of_scope(caller, needed_scope(method, path))
+            elif path not in PROBES:
+                # Behind a proxy all strangers have one address, and a monitor takes 429 for the service's end.
+                self._rates.count(address, address)
         except Refused as refusal:
             await self._refuse(refusal, address, caller, method, path, scope, receive, send)
             return
         scope.setdefault("state", {})["caller"] = caller
-        status, made, is_stream, looked_s, is_over = 0, "", False, time.monotonic(), False
+        status, made, life = 0, "", CancelScope()
+        next_look: asyncio.TimerHandle | None = None
+
+        def look_later() -> None:
+            nonlocal next_look
+            next_look = asyncio.get_running_loop().call_later(_LOOK_AGAIN_S, look)
+
+        def look() -> None:
+            try:
+                self._caller(headers, path)
+            except Refused:
+                life.cancel()
+            else:
+                look_later()
 
         async def noted(message: Message) -> None:
-            nonlocal status, made, is_stream, looked_s, is_over
+            nonlocal status, made
+            await send(message)
             if message["type"] == "http.response.start":
                 kept = Headers(raw=message.get("headers", []))
-                status, made, is_stream = message["status"], kept.get("location", ""), "content-length" not in kept
-            elif is_stream and message.get("more_body") and time.monotonic() >= looked_s + _LOOK_AGAIN_S:
-                looked_s = time.monotonic()
-                try:
-                    self._caller(headers, path)
-                except Refused as refusal:
-                    is_over = True
-                    # To whoever makes the stream it is as if the client had gone.
-                    raise ConnectionAbortedError(str(refusal)) from refusal
-            await send(message)
+                status, made = message["status"], kept.get("location", "")
+                if "content-length" not in kept:
+                    # It may be a stream, and last.
+                    look_later()
 
         name = ANYONE if caller is None else caller.name
         try:
-            with acting_as(name, key="" if caller is None else caller.key):
+            with acting_as(name, key="" if caller is None else caller.key), life:
                 await self._app(scope, receive, noted)
-        except Exception:
-            if not is_over:
-                raise
+        finally:
+            if next_look is not None:
+                next_look.cancel()
+        if life.cancelled_caught:
             await send({"type": "http.response.body", "body": b"", "more_body": False})
         if method not in READING or path == LINK_PATH:
             await self._note(name, address, method, path, status, made)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from typing import Annotated, Any, Literal
 from uuid import UUID
 
@@ -16,7 +17,7 @@ from starlette.exceptions import HTTPException
 
 from slrig.api.problems import file_of, problems
 from slrig.api.schemas import MOST_EXPOSURE_S, FaultBody, PatternRequest, ProgressBody, filled, pattern_plan
-from slrig.api.service import IdempotencyKey, Service, Serving, started_once
+from slrig.api.service import IdempotencyKey, Probed, Service, Serving, started_once
 from slrig.bundle import CAMERA_NAME, MAX_CALIBRATION_BYTES, FreeText, SafeText, Strict
 from slrig.calibrate.job import EXPORTS, PoseRequest
 from slrig.calibrate.store import (
@@ -414,8 +415,9 @@ async def import_calibration(
     return await run_in_threadpool(_answered, service, record)
 
 
-@router.get("/board.pdf", response_class=Response, responses=file_of("application/pdf"))
-def fetch_board(
+@router.get("/board.pdf", response_class=Response, responses=file_of("application/pdf", 503))
+async def fetch_board(
+    service: Probed,
     kind: BoardKind = DEFAULT_BOARD.kind,
     columns: CornerCount = DEFAULT_BOARD.columns,
     rows: CornerCount = DEFAULT_BOARD.rows,
@@ -436,13 +438,15 @@ def fetch_board(
     board = Board(kind, columns, rows, square_mm, marker_mm, dictionary)
     name = f"board-{kind}-{columns}x{rows}-{square_mm:g}mm.pdf"
     headers = {"Content-Disposition": f'inline; filename="{name}"', "Cache-Control": "no-store"}
-    return Response(board_pdf(board, page=page), media_type="application/pdf", headers=headers)
+    pdf = await service.makings.of((board, page), partial(board_pdf, board, page=page))
+    return Response(pdf, media_type="application/pdf", headers=headers)
 
 
-@router.get("/compare", responses=problems(404, 409))
-def compare_calibrations(service: Serving, first: UUID, second: UUID) -> ComparisonBody:
+@router.get("/compare", responses=problems(404, 409, 503))
+async def compare_calibrations(service: Serving, first: UUID, second: UUID) -> ComparisonBody:
     """Compare two calibrations of one rig: each device's differences in their σ, and by how much points move."""
-    return filled(ComparisonBody, service.calibrations.compare(first, second), first=first, second=second)
+    compare = partial(service.calibrations.compare, first, second)
+    return filled(ComparisonBody, await service.clouds.of((first, second), compare), first=first, second=second)
 
 
 @router.get("/{calibration_id}")
@@ -565,9 +569,10 @@ def delete_calibration(service: Serving, calibration_id: UUID) -> None:
     service.calibrations.delete(calibration_id)
 
 
-def _serve(name: str, media_type: str) -> Callable[..., Response]:
-    def fetch(service: Serving, calibration_id: UUID) -> Response:
-        content = service.calibrations.exported(calibration_id, name)
+def _serve(name: str, media_type: str) -> Callable[..., Awaitable[Response]]:
+    async def fetch(service: Serving, calibration_id: UUID) -> Response:
+        export = partial(service.calibrations.exported, calibration_id, name)
+        content = await service.makings.of((calibration_id, name), export)
         # Another solve of the same session gives another file.
         headers = {"Content-Disposition": f'inline; filename="{name}"', "Cache-Control": "no-store"}
         return Response(content, media_type=media_type, headers=headers)
@@ -581,7 +586,7 @@ for _name, _media_type in zip(EXPORTS, ("application/json", "application/yaml", 
         f"/{{calibration_id}}/{_name}",
         _serve(_name, _media_type),
         response_class=Response,
-        responses=file_of(_media_type, 409, 507),
+        responses=file_of(_media_type, 409, 503, 507),
         operation_id=f"fetch_{_name.replace('.', '_')}",
         summary=f"Fetch {_name}",
     )
@@ -620,8 +625,8 @@ def fetch_pose_picture(
     return FileResponse(path, media_type="image/png", headers={"Cache-Control": "private, no-cache"})
 
 
-@router.get("/{calibration_id}/coverage.png", response_class=Response, responses=file_of("image/png", 409))
-def fetch_coverage_picture(
+@router.get("/{calibration_id}/coverage.png", response_class=Response, responses=file_of("image/png", 409, 503))
+async def fetch_coverage_picture(
     service: Serving,
     calibration_id: UUID,
     device: Annotated[
@@ -629,5 +634,6 @@ def fetch_coverage_picture(
     ] = None,
 ) -> Response:
     """Return a picture of what a device has seen of the board so far, and of where the board should go next."""
-    content = service.calibrations.coverage_picture(calibration_id, device)
+    draw = partial(service.calibrations.coverage_picture, calibration_id, device)
+    content = await service.makings.of((calibration_id, "coverage", device), draw)
     return Response(content, media_type="image/png", headers={"Cache-Control": "no-store"})

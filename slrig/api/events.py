@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections import Counter
 from collections.abc import AsyncIterator, Callable, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any
 from uuid import UUID
 
-from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi import APIRouter, Depends, Header, Query, Response
 from fastapi.concurrency import run_in_threadpool
 from sse_starlette import EventSourceResponse, ServerSentEvent
-from starlette.exceptions import HTTPException
 
 from slrig.api.problems import fault_problem, problems
-from slrig.api.service import Serving
+from slrig.api.service import Service, Serving
 from slrig.calibrate.store import CalibrationRegister, SessionState
-from slrig.config import ServiceSettings
 from slrig.errors import CalibrationNotFoundError, JobNotFoundError
 from slrig.failure import JobFailure
 from slrig.jobs.records import RIG_JOBS, JobEvent, JobKind, JobState
@@ -49,64 +47,13 @@ LastEventId = Annotated[int, _SEEN]
 router = APIRouter()
 
 
-@dataclass(slots=True)
-class OpenStreams:
-    """How many streams are open, and may be; and what each job or calibration is that is followed. Lives on the event
-    loop's thread.
-    """
-
-    limit: int
-    count: int = 0
-    of_keys: Counter[str] = field(default_factory=Counter)
-    followed: dict[UUID, SharedLooks] = field(default_factory=dict)
+async def _until_over() -> AsyncIterator[ExitStack]:
+    with ExitStack() as held:
+        yield held
 
 
-@dataclass(slots=True)
-class Place:
-    """A request's place among the open streams, once it is taken. key : digest of the sender's key; one key has half of
-    all places at most.
-    """
-
-    streams: OpenStreams
-    key: str = ""
-    taken: bool = False
-
-    def take(self) -> None:
-        """Count as open from now until the answer is over. Raises HTTPException 429: as many are open as may."""
-        share = max(self.streams.limit // 2, 1)
-        if self.key and self.streams.of_keys[self.key] >= share:
-            detail = f"{share} streams of this key are open, as many as one key may have. Close one."
-            raise HTTPException(429, detail, headers={"Retry-After": "5"})
-        if self.streams.count >= self.streams.limit:
-            detail = (
-                f"{self.streams.count} streams of events or pictures are open, as many as may. Close one, or ask for "
-                "GET /scan/ID instead."
-            )
-            raise HTTPException(429, detail, headers={"Retry-After": "5"})
-        self.streams.count += 1
-        self.streams.of_keys[self.key] += 1
-        self.taken = True
-
-    def leave(self) -> None:
-        """Count as open no longer."""
-        if self.taken:
-            self.streams.count -= 1
-            self.streams.of_keys[self.key] -= 1
-            self.streams.of_keys += Counter()
-
-
-async def _place(request: Request) -> AsyncIterator[Place]:
-    caller = getattr(request.state, "caller", None)
-    place = Place(request.app.state.streams, "" if caller is None else caller.key)
-    try:
-        yield place
-    finally:
-        # The answer is over, also one whose client was gone before it began.
-        place.leave()
-
-
-StreamPlace = Annotated[Place, Depends(_place)]
-"""A handler's parameter: the place that its stream has to take."""
+Held = Annotated[ExitStack, Depends(_until_over)]
+"""A handler's parameter: what is held until the answer is over, also one whose client was gone before it began."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,40 +157,36 @@ _CALIBRATION = _answers(
 
 
 @router.get("/scan/{scan_id}/events", tags=["scan"], response_class=Response, responses=_JOB)
-async def follow_scan(place: StreamPlace, service: Serving, scan_id: UUID, last_event_id: LastEventId = 0) -> Response:
+async def follow_scan(held: Held, service: Serving, scan_id: UUID, last_event_id: LastEventId = 0) -> Response:
     """Follow a scan until it is over. Events that happened before come first."""
-    return await _follow_job(place, service, JobKind.SCAN, scan_id, last_event_id)
+    return await _follow_job(held, service, JobKind.SCAN, scan_id, last_event_id)
 
 
 @router.get("/rig/verification/{verification_id}/events", tags=["health"], response_class=Response, responses=_JOB)
 async def follow_verification(
-    place: StreamPlace, service: Serving, verification_id: UUID, last_event_id: LastEventId = 0
+    held: Held, service: Serving, verification_id: UUID, last_event_id: LastEventId = 0
 ) -> Response:
     """Follow a verification until it is over. Events that happened before come first."""
-    return await _follow_job(place, service, JobKind.VERIFICATION, verification_id, last_event_id)
+    return await _follow_job(held, service, JobKind.VERIFICATION, verification_id, last_event_id)
 
 
 @router.get("/rig/job/{job_id}/events", tags=["rig"], response_class=Response, responses=_JOB)
-async def follow_rig_job(
-    place: StreamPlace, service: Serving, job_id: UUID, last_event_id: LastEventId = 0
-) -> Response:
+async def follow_rig_job(held: Held, service: Serving, job_id: UUID, last_event_id: LastEventId = 0) -> Response:
     """Follow an examination of the rig until it is over. Events that happened before come first."""
-    return await _follow_job(place, service, None, job_id, last_event_id)
+    return await _follow_job(held, service, None, job_id, last_event_id)
 
 
 @router.get("/model/{model_id}/events", tags=["model"], response_class=Response, responses=_JOB)
-async def follow_model(
-    place: StreamPlace, service: Serving, model_id: UUID, last_event_id: LastEventId = 0
-) -> Response:
+async def follow_model(held: Held, service: Serving, model_id: UUID, last_event_id: LastEventId = 0) -> Response:
     """Follow a model until it is over. Events that happened before come first."""
-    return await _follow_job(place, service, JobKind.MODEL, model_id, last_event_id)
+    return await _follow_job(held, service, JobKind.MODEL, model_id, last_event_id)
 
 
 @router.get(
     "/calibration/{calibration_id}/events", tags=["calibration"], response_class=Response, responses=_CALIBRATION
 )
 async def follow_calibration(
-    place: StreamPlace, service: Serving, calibration_id: UUID, last_event_id: LastEventId = 0
+    held: Held, service: Serving, calibration_id: UUID, last_event_id: LastEventId = 0
 ) -> Response:
     """Follow a calibration while something is under way. Events that happened before come first."""
     register = service.calibrations.register
@@ -253,12 +196,12 @@ async def follow_calibration(
         partial(service.store.watch, calibration_id),
         partial(service.store.last_event_of, calibration_id),
     )
-    return await _stream(place, service.settings, calibration_id, followed, last_event_id)
+    return await _stream(held, service, calibration_id, followed, last_event_id)
 
 
 @router.get("/events", tags=["system"], response_class=Response, responses=_EVERYTHING)
 async def follow_everything(
-    place: StreamPlace,
+    held: Held,
     service: Serving,
     last_event_id: Annotated[int | None, _SEEN] = None,
     after: Annotated[
@@ -269,15 +212,15 @@ async def follow_everything(
     followed = followed_feed(service.store, _BATCH)
     seen = after if last_event_id is None else last_event_id
     if seen is not None:
-        return _opened(place, service.settings, EVERY_JOB, followed, seen)
+        return _opened(held, service, EVERY_JOB, followed, seen)
     now = await run_in_threadpool(followed.last)
-    return _opened(place, service.settings, EVERY_JOB, followed, now, begins=now)
+    return _opened(held, service, EVERY_JOB, followed, now, begins=now)
 
 
-async def _follow_job(place: Place, service: Serving, kind: JobKind | None, job_id: UUID, after: int) -> Response:
+async def _follow_job(held: ExitStack, service: Service, kind: JobKind | None, job_id: UUID, after: int) -> Response:
     # One that is on no record is refused here; one that is deleted later only ends its stream.
     await run_in_threadpool(service.store.get, job_id, *(RIG_JOBS if kind is None else (kind,)))
-    return await _stream(place, service.settings, job_id, followed_job(service.store, job_id), after)
+    return await _stream(held, service, job_id, followed_job(service.store, job_id), after)
 
 
 def followed_feed(jobs: JobStore, most: int) -> Followed:
@@ -336,22 +279,23 @@ def _of_calibration(event: JobEvent, pose: int | None) -> JobEvent:
     return replace(event, data={**event.data, "state": _SOLVES[event.data["state"]]})
 
 
-async def _stream(place: Place, settings: ServiceSettings, key: UUID, followed: Followed, after: int) -> Response:
+async def _stream(held: ExitStack, service: Service, key: UUID, followed: Followed, after: int) -> Response:
     """The events after one, and those that follow until no more will come. Raises HTTPException 429."""
     events, over = await run_in_threadpool(followed.look, after)
     if over and not events:
         # An EventSource that reconnects after the last event is told by 204 to stop trying.
         return Response(status_code=204)
-    return _opened(place, settings, key, followed, after)
+    return _opened(held, service, key, followed, after)
 
 
 def _opened(
-    place: Place, settings: ServiceSettings, key: UUID, followed: Followed, after: int, *, begins: int | None = None
+    held: ExitStack, service: Service, key: UUID, followed: Followed, after: int, *, begins: int | None = None
 ) -> Response:
     """A stream of the events after one. See `told`. Raises HTTPException 429."""
-    place.take()
+    held.enter_context(service.streams.take())
+    settings = service.settings
     return EventSourceResponse(
-        told(place.streams, key, followed, after, begins=begins),
+        told(service.followed, key, followed, after, begins=begins),
         ping=settings.keepalive_s,
         sep="\n",
         # At the end of the service all work ends, and its stream by that; without this the stream would end first.
@@ -360,13 +304,13 @@ def _opened(
 
 
 async def told(
-    streams: OpenStreams, key: UUID, followed: Followed, after: int, *, begins: int | None = None
+    open_looks: dict[UUID, SharedLooks], key: UUID, followed: Followed, after: int, *, begins: int | None = None
 ) -> AsyncIterator[ServerSentEvent]:
     """Each event after one, as it comes, until no more will. key : the same for all who follow the same.
 
     begins : a number to say first, so that a client that lost the connection before the first event can go on.
     """
-    shared = streams.followed.setdefault(key, SharedLooks(followed))
+    shared = open_looks.setdefault(key, SharedLooks(followed))
     news = shared.join()
     try:
         # A client that names an event that has not come yet would never be told that it has.
@@ -385,7 +329,7 @@ async def told(
     finally:
         shared.leave(news)
         if shared.unused:
-            streams.followed.pop(key, None)
+            open_looks.pop(key, None)
 
 
 def _data(event: JobEvent) -> dict[str, Any]:

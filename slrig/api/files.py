@@ -6,8 +6,9 @@ import os
 import threading
 import time
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import nullcontext, suppress
+from collections.abc import Awaitable, Callable, Iterable, Iterator
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 from uuid import UUID
@@ -15,8 +16,10 @@ from uuid import UUID
 import structlog
 from fastapi import APIRouter, Header, Response
 from fastapi import Path as PathParameter
+from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, StreamingResponse
 
+from slrig.api.events import Held
 from slrig.api.problems import BYTES, file_of
 from slrig.api.service import Service, Serving
 from slrig.bundle import CALIBRATION, CAMERA_NAME, DESCRIPTION, write_file
@@ -48,12 +51,8 @@ from slrig.scan.job import cloud_bytes
 LONGEST_WAIT_S = 30.0
 """From when on a request that waits for the worker is told to come again: clients wait a minute for an answer."""
 
-MOST_WAITING = 8
-"""Requests that may wait for the worker: each holds one of the forty threads that answer."""
-
 # A cloud takes the worker half a second and some hundred megabytes: one at a time, whoever asks.
 _making = threading.Lock()
-_places = threading.BoundedSemaphore(MOST_WAITING)
 
 
 def clouds_of(folder: DataFolder, scan: Path, names: Iterable[str]) -> set[str]:
@@ -77,13 +76,17 @@ def has_sources(folder: DataFolder, scan: Path, camera: str | None) -> bool:
     return all(folder.owns(scan / source) for source in sources)
 
 
-def make_cloud(service: Service, scan_id: UUID, form: str, camera: str | None) -> None:
+def _make_cloud(service: Service, scan_id: UUID, form: str, camera: str | None, until_s: float) -> None:
     """Make one of `requested_forms` of a finished scan in the worker, and keep it, unless it exists.
+
+    until_s : from when on, by the monotonic clock, it does not wait for the worker any more.
 
     Raises
     ------
+    ArtefactNotReadyError
+        The scan is not over, or the file cannot be made of it.
     WorkerBusyError
-        It was not its turn for too long, or too many wait.
+        It was not its turn for too long.
     ExtraMissingError
         The format takes a library that is not installed.
     InvalidInputError, NothingToReconstructError
@@ -97,35 +100,28 @@ def make_cloud(service: Service, scan_id: UUID, form: str, camera: str | None) -
     """
     place = service.folder.scan(scan_id)
     path = place / form.format(camera=camera)
-    until_s = time.monotonic() + LONGEST_WAIT_S
-    if not _places.acquire(blocking=False):
-        message = f"{MOST_WAITING} requests wait for the worker already. Ask again for {path.name}."
+    record = _record(service, scan_id)
+    if not record.state.final or not has_sources(service.folder, place, camera):
+        refuse_absent(record, path.name)
+    require_whole(service, record, place, *read_entries(place))
+    if not _making.acquire(timeout=max(until_s - time.monotonic(), 0.0)):
+        message = f"Another file is made first, and {path.name} has to wait for it. Ask again."
         raise WorkerBusyError(message)
     try:
-        if not _making.acquire(timeout=LONGEST_WAIT_S):
-            message = f"Another file is made first, and {path.name} has to wait for it. Ask again."
-            raise WorkerBusyError(message)
-        try:
-            if os.path.lexists(path):
-                return
+        if not os.path.lexists(path):
             task = Task(cloud_bytes, (place, form, camera), what=f"making of {path.name}", remedy="Ask again.")
             data = service.worker.run(task, within_s=max(until_s - time.monotonic(), 0.0))
             # From here, not by the worker: where that is killed nothing is left half written.
             service.folder.require_space(len(data) + service.settings.min_free_bytes)
             write_file(path, data)
-        finally:
-            _making.release()
     except (InvalidInputError, StorageError) as error:
         if service.folder.owns(place):
             raise
         message = f"Scan {scan_id} was deleted while {path.name} was made of it."
         raise JobNotFoundError(message) from error
     finally:
-        _places.release()
+        _making.release()
 
-
-# A conversion takes a second and some hundred megabytes: one at a time, whoever asks.
-_converting = threading.Lock()
 
 _CHUNK_BYTES = 2**20
 _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -181,18 +177,37 @@ def refuse_absent(record: JobRecord, name: str) -> None:
     raise ArtefactNotReadyError(message)
 
 
-def _file(service: Service, scan_id: UUID, name: str, media_type: str, known: str | None) -> Response:
+def _record(service: Service, scan_id: UUID) -> JobRecord:
+    """Of a scan whose files are being read."""
+    record = service.store.get(scan_id, JobKind.SCAN)
+    service.retention.reading(scan_id)
+    return record
+
+
+def _convert(service: Service, scan_id: UUID, name: str) -> tuple[JobRecord, bytes | None]:
+    """Make one of `ON_REQUEST`: kept where its scan is over, returned with the record while it is under way."""
+    record, place = _record(service, scan_id), service.folder.scan(scan_id)
+    if record.state.final and service.folder.owns(place / MESH) and not os.path.lexists(place / name):
+        require_whole(service, record, place, MESH)
+        write_converted(place, name)
+    return record, _made_so_far(service.folder, record, name)
+
+
+def _file(
+    service: Service,
+    scan_id: UUID,
+    name: str,
+    media_type: str,
+    known: str | None,
+    converted_now: tuple[JobRecord, bytes | None] | None = None,
+) -> Response:
     place = service.folder.scan(scan_id)
     path = place / name
-    is_made = name in ON_REQUEST and not os.path.lexists(path)
-    with _converting if is_made else nullcontext():
-        # Looked up now: while others waited for their conversion the scan may have ended, and then this one is kept.
-        record = service.store.get(scan_id, JobKind.SCAN)
-        service.retention.reading(scan_id)
-        if is_made and record.state.final and service.folder.owns(place / MESH) and not os.path.lexists(path):
-            require_whole(service, record, place, MESH)
-            write_converted(place, name)
+    if converted_now is None:
+        record = _record(service, scan_id)
         made = _made_so_far(service.folder, record, name)
+    else:
+        record, made = converted_now
     if made is None and record.state.final:
         require_whole(service, record, place, MESH if name in ON_REQUEST else name)
     if made is None and not (record.state.final and service.folder.owns(path)):
@@ -234,19 +249,15 @@ def _kept(path: Path, media_type: str, headers: dict[str, str]) -> Response:
 
 
 def _cloud(service: Service, scan_id: UUID, form: str, camera: str | None, known: str | None) -> Response:
-    """One of `requested_forms`. Made only when a scan is over: it takes all of its files."""
+    """One of `requested_forms`, once it is made. That is only when a scan is over: it takes all of its files."""
     place = service.folder.scan(scan_id)
     path = place / form.format(camera=camera)
-    record = service.store.get(scan_id, JobKind.SCAN)
-    service.retention.reading(scan_id)
+    record = _record(service, scan_id)
     if not record.state.final or not has_sources(service.folder, place, camera):
         refuse_absent(record, path.name)
     headers = _headers(scan_id, path.name, place)
     if _still_known(known, headers["ETag"]):
         return Response(status_code=304, headers=headers)
-    if not os.path.lexists(path):
-        require_whole(service, record, place, *read_entries(place))
-        make_cloud(service, scan_id, form, camera)
     if not service.folder.owns(path):
         refuse_absent(record, path.name)
     return _kept(path, requested_forms()[form], headers)
@@ -281,16 +292,22 @@ def _still_known(known: str | None, tag: str) -> bool:
     return "*" in tags or tag in tags
 
 
-def _serve(name: str, media_type: str) -> Callable[..., Response]:
+def _serve(name: str, media_type: str) -> Callable[..., Response | Awaitable[Response]]:
     def fetch(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
         return _file(service, scan_id, name, media_type, known)
 
+    async def make(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
+        made = None
+        if not await run_in_threadpool(os.path.lexists, service.folder.scan(scan_id) / name):
+            made = await service.makings.of((scan_id, name), partial(_convert, service, scan_id, name))
+        return await run_in_threadpool(_file, service, scan_id, name, media_type, known, made)
+
     made = " It is made of mesh.ply when it is asked for, and kept once the scan is over." if name in ON_REQUEST else ""
-    fetch.__doc__ = (
+    fetch.__doc__ = make.__doc__ = (
         f"Return {name} of a scan that succeeded, or that is being reconstructed, as soon as it is there.{made} ETags "
         "are honoured, and ranges once the scan is over."
     )
-    return fetch
+    return make if name in ON_REQUEST else fetch
 
 
 _UNCHANGED: dict[int | str, dict[str, Any]] = {304: {"description": "the file is the one whose ETag was sent"}}
@@ -310,23 +327,30 @@ for _name, _media_type in MEDIA_TYPES.items():
         _fetch,
         methods=["GET"],
         response_class=Response,
-        responses=file_answers(_media_type),
+        responses=file_answers(_media_type, *([503] if _name in ON_REQUEST else [])),
         operation_id=f"fetch_{_name.replace('.', '_')}",
         summary=f"Fetch {_name}",
     )
 
 
-def _serve_cloud(form: str) -> Callable[..., Response]:
+def _serve_cloud(form: str) -> Callable[..., Awaitable[Response]]:
+    async def made(service: Service, scan_id: UUID, camera: str | None, known: str | None) -> Response:
+        name = form.format(camera=camera)
+        if not await run_in_threadpool(os.path.lexists, service.folder.scan(scan_id) / name):
+            make = partial(_make_cloud, service, scan_id, form, camera, time.monotonic() + LONGEST_WAIT_S)
+            await service.clouds.of((scan_id, name), make)
+        return await run_in_threadpool(_cloud, service, scan_id, form, camera, known)
+
     if "{camera}" in form:
 
-        def fetch(service: Serving, scan_id: UUID, camera: Camera, known: KnownTag = None) -> Response:
-            return _cloud(service, scan_id, form, camera, known)
+        async def fetch(service: Serving, scan_id: UUID, camera: Camera, known: KnownTag = None) -> Response:
+            return await made(service, scan_id, camera, known)
 
         what = f"{form.format(camera='CAMERA')}, the surface of a finished scan in the grid of a camera"
     else:
 
-        def fetch(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:  # type: ignore[misc]
-            return _cloud(service, scan_id, form, None, known)
+        async def fetch(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:  # type: ignore[misc]
+            return await made(service, scan_id, None, known)
 
         what = f"{form}, a finished scan with the points of all cameras"
     fetch.__doc__ = (
@@ -390,13 +414,17 @@ def fetch_agreement(
 
 
 @router.get(f"/{BUNDLE_ZIP}", response_class=Response, responses={**file_of("application/zip", 409), **_UNCHANGED})
-def fetch_bundle(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
+async def fetch_bundle(held: Held, service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
     """Return the recorded frames and all that belongs to them; unzipped, `slrig reconstruct` reads them.
 
     A scan whose reconstruction failed has its bundle, too.
     """
-    record = service.store.get(scan_id, JobKind.SCAN)
-    service.retention.reading(scan_id)
+    held.enter_context(service.streams.take())
+    return await run_in_threadpool(_bundle, service, scan_id, known)
+
+
+def _bundle(service: Service, scan_id: UUID, known: str | None) -> Response:
+    record = _record(service, scan_id)
     bundle = service.folder.scan(scan_id) / BUNDLE
     if not record.state.final or not service.folder.owns(bundle):
         refuse_absent(record, BUNDLE_ZIP)

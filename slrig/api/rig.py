@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from datetime import datetime
+from functools import partial
 from typing import Annotated, Any
 from uuid import UUID
 
@@ -16,7 +17,7 @@ from pydantic import BaseModel, Field
 from starlette.responses import StreamingResponse
 
 from slrig.api.calibration import BoardRequest, IfBusy
-from slrig.api.events import StreamPlace
+from slrig.api.events import Held
 from slrig.api.files import require_whole
 from slrig.api.problems import file_of, problems
 from slrig.api.schemas import (
@@ -117,10 +118,14 @@ class DeviceList(BaseModel):
 
 
 @router.get("/device", responses=problems(409))
-def list_devices(service: Serving) -> DeviceList:
+async def list_devices(service: Serving) -> DeviceList:
     """Return the drivers that are installed, the devices that are plugged in, and the libraries that are missing. While
     the rig is held, those that were plugged in before.
     """
+    return await service.probes.of("devices", partial(_devices, service))
+
+
+def _devices(service: Service) -> DeviceList:
     found = service.devices.found(service.manager.status().holder)
     return filled(DeviceList, found, drivers=installed_drivers(), faults=[str(fault) for fault in found.faults])
 
@@ -160,7 +165,7 @@ def _camera(name: str, camera: CameraInfo, settings: SettingsInUse | None) -> Ca
 
 @router.get("/preview/{camera}", response_class=Response, responses={**_STREAM, **problems(409, 429, 502, 503)})
 async def look_through_camera(
-    place: StreamPlace,
+    held: Held,
     service: Serving,
     camera: Annotated[str, Path(max_length=64, description="name of a camera of the rig")],
     light: Annotated[Light, Query(description="what the projector does meanwhile: dark, or all white")] = Light.OFF,
@@ -169,7 +174,7 @@ async def look_through_camera(
     ] = False,
 ) -> Response:
     """Look through a camera while nobody scans: an `img` element shows it. A scan that comes goes first."""
-    place.take()
+    held.enter_context(service.streams.take())
     watch = await run_in_threadpool(service.manager.watch, camera, light)
     return StreamingResponse(
         _parts(watch, marked=marks),

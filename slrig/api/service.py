@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 from uuid import UUID
 
 import structlog
@@ -18,6 +18,7 @@ from pydantic import BaseModel
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from slrig.accept.job import AcceptanceTests
+from slrig.api.shares import Makings, Shares
 from slrig.bundle import Preset, ScanDefaults
 from slrig.calibrate.job import CalibrationArchive, Calibrations
 from slrig.calibrate.verification import RigHealth
@@ -138,6 +139,16 @@ _log = structlog.get_logger(__name__)
 _MOST_ON_RECORD = 1000
 """Verifications, and examinations of each kind, that stay on record. What verifications found is kept longer."""
 
+MOST_REQUESTS = 256
+"""That wait for their answers, of everybody together. Of one key eight are answered at once: more of them would keep
+the interpreter from the others' for longer, and end no sooner.
+"""
+
+MOST_MAKINGS = 8
+"""Files that are made on request, or wait for that; of one key one after the other. Each takes a second, and some
+hundred megabytes.
+"""
+
 _SCHEDULE_END_S = 1.0
 """How long a scheduled run may take to end by itself before the runner ends it."""
 
@@ -145,8 +156,9 @@ _SCHEDULE_END_S = 1.0
 class Service:
     """One service: its settings, its jobs, what these belong to, and the schedule.
 
-    Until `start` nothing works. refuse_when_stale : whether the rig file has scans refused then. tolerance_mm :
-    what it wants of a point's error. presets : the rig file's.
+    Until `start` nothing works. followed : what streams follow, see `slrig.api.events.told`. refuse_when_stale :
+    whether the rig file has scans refused then. tolerance_mm : what it wants of a point's error. presets : the rig
+    file's.
 
     Raises
     ------
@@ -177,6 +189,17 @@ class Service:
         self.refuse_when_stale = refuse_when_stale
         self.hurry = threading.Event()
         self.devices = DeviceSearch()
+        close = "Close one, or ask for single answers instead, as GET /scan/ID."
+        self.streams = Shares("streams of events, pictures and bundles", settings.max_event_streams, close)
+        self.followed: dict[UUID, Any] = {}
+        self.requests = Shares(
+            "places for requests", MOST_REQUESTS, "Wait for answers before you ask for more.", retry_s=1, at_once=8
+        )
+        again, makings = "Ask again.", "places for what is made on request"
+        self.makings = Makings(Shares(makings, MOST_MAKINGS, again, status=503))
+        self.clouds = Makings(Shares(f"{makings} by the worker", MOST_MAKINGS, again, status=503))
+        # Two of them, each made once for all: nobody is refused.
+        self.probes = Makings(Shares("probes and searches for devices", 2, again, status=503, at_once=2))
         self._lasting: frozenset[str] = frozenset()
         database, outbox = self.store.database, self.store.outbox
         self.senders = senders_of(settings, outbox)
@@ -319,6 +342,15 @@ def _lasting_threads() -> frozenset[str]:
 async def _of_request(request: Request) -> Service:
     service: Service = request.app.state.service
     return service
+
+
+async def turn(request: Request) -> AsyncIterator[None]:
+    """Has a request wait for its turn among those of its key; what needs no key, or ends work, waits for nobody."""
+    if request.state.caller is None or request.url.path.endswith("/cancel"):
+        yield
+        return
+    async with request.app.state.service.requests.turn():
+        yield
 
 
 def _whole(service: Annotated[Service, Depends(_of_request)]) -> Service:

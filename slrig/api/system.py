@@ -8,6 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,6 +34,9 @@ from slrig.jobs.manager import RigStatus
 from slrig.jobs.records import JobKind, JobState, utc_now
 from slrig.jobs.store import AuditEntry
 from slrig.schedule.store import RunState, TaskKind
+
+_FRESH_S = 1.0
+"""For how long a probe is told what was found for the one before: everybody may ask, as often as they like."""
 
 router = APIRouter(tags=["system"])
 
@@ -151,12 +155,17 @@ async def livez() -> Probe:
 
 
 @router.get("/readyz", response_model=Probe, responses=problems(503), openapi_extra={"security": []})
-def readyz(service: Probed) -> Response | Probe:
+async def readyz(service: Probed) -> Response | Probe:
     """Tell whether a scan could start and end well: records, disk, rig, reconstruction. Touches no device.
 
     A rig that is held is well. `pending` names what is not ready yet and gets there by itself: the rig while it is
-    opened, the reconstruction until its process has loaded its kernels, which the first time takes a minute.
+    opened, the reconstruction until its process has loaded its kernels, which the first time takes a minute. What was
+    found stands for a second.
     """
+    return await service.probes.of("ready", partial(_ready, service), fresh_s=_FRESH_S)
+
+
+def _ready(service: Service) -> Response | Probe:
     status = service.manager.status()
     checks = {
         "records": _storage(service.store.check),

@@ -12,6 +12,7 @@ import pytest
 from fastapi import APIRouter, FastAPI
 from fastapi.testclient import TestClient
 
+from slrig.api import system
 from slrig.api.app import create_app
 from slrig.api.auth import KeyRing
 from slrig.api.problems import install_problems
@@ -62,6 +63,7 @@ class ServedBench(TameBench):
         }
         for each in (self.captures(), self.tame.patched(), stand_ins(functions)):
             patched.enter_context(each)
+        patched.enter_context(pytest.MonkeyPatch.context()).setattr(system, "_FRESH_S", 0.0)
         self.unpatch = patched.close
         rig = RigSession("bench", self.open_rig)
         manager = JobManager(store, folder, rig, self.worker, *KINDS, queue_length=1)

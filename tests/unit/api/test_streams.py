@@ -21,7 +21,7 @@ from sse_starlette import ServerSentEvent
 from starlette.types import Receive, Scope, Send
 
 from slrig.api import server as connections
-from slrig.api.events import Followed, OpenStreams, followed_feed, followed_job
+from slrig.api.events import Followed, SharedLooks, followed_feed, followed_job
 from slrig.api.events import told as stream_of
 from slrig.api.server import (
     ConnectionConfig,
@@ -59,7 +59,7 @@ class Jobs:
     def __init__(self, folder: Path) -> None:
         database = Database(folder / "slrig.sqlite")
         self.store = ActingStore(database)
-        self.streams = OpenStreams(99)
+        self.open: dict[UUID, SharedLooks] = {}
         self.looks: list[int] = []
 
     def followed(self, *, most: int = 500) -> Followed:
@@ -80,12 +80,12 @@ class Jobs:
         return job.id
 
     def follow(self, after: int = 0, *, most: int = 500) -> AsyncGenerator[ServerSentEvent]:
-        stream = stream_of(self.streams, EVERY_JOB, self.followed(most=most), after)
+        stream = stream_of(self.open, EVERY_JOB, self.followed(most=most), after)
         assert isinstance(stream, AsyncGenerator)
         return stream
 
     def follow_scan(self, scan: UUID, after: int) -> AsyncIterator[ServerSentEvent]:
-        return stream_of(self.streams, scan, followed_job(self.store, scan), after)
+        return stream_of(self.open, scan, followed_job(self.store, scan), after)
 
     async def looked(self, count: int) -> None:
         async with asyncio.timeout(WAIT_S):
@@ -121,7 +121,7 @@ async def test_client_ahead_of_its_scan_gets_what_comes_next(jobs: Jobs) -> None
 
     jobs.store.act = go_on
     assert await rest(jobs.follow_scan(scan, 1000)) == ["2", "3"]
-    assert jobs.streams.followed == {}
+    assert jobs.open == {}
 
 
 @pytest.mark.parametrize("final", [True, False])
@@ -198,7 +198,7 @@ async def test_twenty_clients_cost_little_more_than_one(jobs: Jobs) -> None:
     # Each begins somewhere else: no look serves two of them.
     late = [jobs.follow(start, most=2) for start in range(20)]
     await asyncio.gather(*(some(stream, 60 - start) for start, stream in enumerate(late)))
-    assert len(jobs.streams.followed[EVERY_JOB]._looks) <= 16
+    assert len(jobs.open[EVERY_JOB]._looks) <= 16
     for stream in late:
         await stream.aclose()
     jobs.looks.clear()
@@ -222,7 +222,7 @@ async def test_end_of_the_service_ends_the_stream_after_the_last_event(jobs: Job
     jobs.store.end()
     assert (await waiting)[0]["state"] == "interrupted"
     assert await rest(stream) == []
-    assert jobs.streams.followed == {}
+    assert jobs.open == {}
 
 
 @on_loop
@@ -244,7 +244,7 @@ async def test_events_of_a_deleted_job_are_gone_and_others_go_on(jobs: Jobs) -> 
 async def test_client_that_names_no_event_gets_the_number_where_it_begins(jobs: Jobs) -> None:
     jobs.scan(steps=4)
 
-    stream = stream_of(jobs.streams, EVERY_JOB, jobs.followed(), 5, begins=5)
+    stream = stream_of(jobs.open, EVERY_JOB, jobs.followed(), 5, begins=5)
     async with asyncio.timeout(WAIT_S):
         assert (await anext(stream)).encode() == b"id: 5\n\n"
     await asyncio.to_thread(jobs.scan)
@@ -293,10 +293,10 @@ async def test_only_so_many_streams_are_open_at_once(client: TestClient, served:
         assert done, "more streams are open than may"
         refused += [answer.result() for answer in done]
         waiting = list(pending)
-    assert served.app.state.streams.count == 1
+    assert served.service.streams.taken.total() == 1
     gone.set()
     assert (refused, await waiting[0]) == ([429] * 5, 200)
-    assert served.app.state.streams.count == 0
+    assert not served.service.streams.taken
 
 
 @on_loop
@@ -306,7 +306,7 @@ async def test_client_that_is_gone_before_its_stream_begins_keeps_no_place(
     gone = asyncio.Event()
     gone.set()
     await asked(served.app, served.held(client)["links"]["events"], gone)
-    assert served.app.state.streams.count == 0
+    assert not served.service.streams.taken
 
 
 SHORT = Deadlines(head_s=0.3, body_s=0.3, idle_s=1, stall_s=0.3)
