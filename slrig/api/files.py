@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 import zipfile
@@ -108,12 +107,13 @@ def _make_cloud(service: Service, scan_id: UUID, form: str, camera: str | None, 
         message = f"Another file is made first, and {path.name} has to wait for it. Ask again."
         raise WorkerBusyError(message)
     try:
-        if not os.path.lexists(path):
+        if not service.folder.has_made(place, path.name):
             task = Task(cloud_bytes, (place, form, camera), what=f"making of {path.name}", remedy="Ask again.")
             data = service.worker.run(task, within_s=max(until_s - time.monotonic(), 0.0))
             # From here, not by the worker: where that is killed nothing is left half written.
             service.folder.require_space(len(data) + service.settings.min_free_bytes)
             write_file(path, data)
+            service.folder.note_made(place, path.name)
     except (InvalidInputError, StorageError) as error:
         if service.folder.owns(place):
             raise
@@ -187,9 +187,10 @@ def _record(service: Service, scan_id: UUID) -> JobRecord:
 def _convert(service: Service, scan_id: UUID, name: str) -> tuple[JobRecord, bytes | None]:
     """Make one of `ON_REQUEST`: kept where its scan is over, returned with the record while it is under way."""
     record, place = _record(service, scan_id), service.folder.scan(scan_id)
-    if record.state.final and service.folder.owns(place / MESH) and not os.path.lexists(place / name):
+    if record.state.final and service.folder.owns(place / MESH) and not service.folder.has_made(place, name):
         require_whole(service, record, place, MESH)
         write_converted(place, name)
+        service.folder.note_made(place, name)
     return record, _made_so_far(service.folder, record, name)
 
 
@@ -298,7 +299,7 @@ def _serve(name: str, media_type: str) -> Callable[..., Response | Awaitable[Res
 
     async def make(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
         made = None
-        if not await run_in_threadpool(os.path.lexists, service.folder.scan(scan_id) / name):
+        if not await run_in_threadpool(service.folder.has_made, service.folder.scan(scan_id), name):
             made = await service.makings.of((scan_id, name), partial(_convert, service, scan_id, name))
         return await run_in_threadpool(_file, service, scan_id, name, media_type, known, made)
 
@@ -336,7 +337,7 @@ for _name, _media_type in MEDIA_TYPES.items():
 def _serve_cloud(form: str) -> Callable[..., Awaitable[Response]]:
     async def made(service: Service, scan_id: UUID, camera: str | None, known: str | None) -> Response:
         name = form.format(camera=camera)
-        if not await run_in_threadpool(os.path.lexists, service.folder.scan(scan_id) / name):
+        if not await run_in_threadpool(service.folder.has_made, service.folder.scan(scan_id), name):
             make = partial(_make_cloud, service, scan_id, form, camera, time.monotonic() + LONGEST_WAIT_S)
             await service.clouds.of((scan_id, name), make)
         return await run_in_threadpool(_cloud, service, scan_id, form, camera, known)

@@ -21,6 +21,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -43,6 +44,9 @@ RESULT = "result"
 
 FILES = "files.json"
 """In the folder of a finished job: size and digest of each of its files, as they were committed."""
+
+MADE = "made.json"
+"""In the folder of a finished job: size and digest of each file that was made on request since."""
 
 _HOLDER = "holder"
 
@@ -73,6 +77,13 @@ def file_entry(path: Path) -> FileEntry:
     """Digest and length of a file. Raises OSError."""
     with path.open("rb") as file:
         return FileEntry(hashlib.file_digest(file, "sha256").hexdigest(), os.fstat(file.fileno()).st_size)
+
+
+def _read_made(place: Path) -> dict[str, FileEntry]:
+    try:
+        return _entries_adapter.validate_json((place / MADE).read_bytes())
+    except (ValidationError, OSError):
+        return {}
 
 
 def read_entries(folder: Path) -> Mapping[str, FileEntry]:
@@ -160,6 +171,7 @@ class DataFolder:
         self.root = root.resolve()
         self._free = free
         self._whole: dict[Path, tuple[int, int, int]] = {}
+        self._noting = threading.Lock()
         with disk_errors(self.root):
             self.root.mkdir(parents=True, exist_ok=True)
             # Whichever thread ends the service lets it go; a kernel that cannot lock is a refusal, not a makeshift.
@@ -361,6 +373,26 @@ class DataFolder:
         if unknown:
             require_whole(place, *unknown, remedy="They are not given out.")
         self._whole.update(looked)
+
+    def note_made(self, place: Path, name: str) -> None:
+        """Keep the digest of a file that was made on request in the folder of a finished job. Raises StorageError."""
+        with self._noting, disk_errors(place):
+            made = {**_read_made(place), name: file_entry(place / name)}
+            write_file(place / MADE, _entries_adapter.dump_json(made))
+
+    def has_made(self, place: Path, name: str) -> bool:
+        """Whether a file that was made on request is there, as it was made; read once, until it changes."""
+        entry, path = _read_made(place).get(name), place / name
+        if entry is None or path.is_symlink():
+            return False
+        with suppress(OSError):
+            found = path.stat()
+            looked = (found.st_ino, found.st_size, found.st_mtime_ns)
+            if self._whole.get(path) == looked or file_entry(path) == entry:
+                self._whole[path] = looked
+                return True
+        _log.warning("a file that was made on request is damaged, and made anew", file=str(path))
+        return False
 
     def remove(self, place: Path, trash: Path | None = None) -> None:
         """Remove files by one rename out of their place first, or move them to `trash`. Idempotent.

@@ -132,6 +132,18 @@ def test_damaged_files_of_results_are_reported_never_served_and_made_anew(
         shutil.rmtree(root)
 
 
+@pytest.mark.parametrize("kind", ["flipped", "cut", "emptied", "removed"])
+def test_damaged_files_that_were_made_on_request_are_made_anew(sound: Sound, tmp_path: Path, kind: str) -> None:
+    root, rng = tmp_path / "data", np.random.default_rng(7)
+    shutil.copytree(sound.root, root)
+    made = sorted(root.glob("scans/*/view.glb")) + sorted(root.glob("scans/*/mesh.stl"))
+    assert len(made) == 4
+    for path in (*made, made[0].with_name("made.json")):
+        damage(path, kind, rng)
+    with serving(root) as (_, client):
+        assert {path: content for path, (_, content) in fetched(client).items()} == sound.answers
+
+
 GARBAGE: dict[str, bytes | None] = {
     "emptied": b"",
     "opened": b"{",
