@@ -6,6 +6,7 @@ are decided at the edges (`slrig.api.problems`, `slrig.cli`), never here.
 
 from __future__ import annotations
 
+import threading
 from typing import ClassVar
 
 _FLAGS = {
@@ -26,6 +27,11 @@ def setting(name: str) -> str:
     'gray_cell_px (--gray-cell-px)'
     """
     return f"{name} (--{_FLAGS.get(name, name.replace('_', '-'))})"
+
+
+def asks_to_end(error: BaseException) -> bool:
+    """Whether an error is Ctrl-C, which ends a command and comes on its main thread, and not one of foreign code."""
+    return isinstance(error, KeyboardInterrupt) and threading.current_thread() is threading.main_thread()
 
 
 class SlrigError(Exception):

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+
+import structlog
 
 from slrig.errors import (
     DeviceError,
@@ -102,6 +106,28 @@ def disk_errors(path: Path) -> Iterator[None]:
         if error.errno not in _DISK_REFUSALS:
             raise
         raise StorageError(disk_error_message(error, path)) from error
+
+
+_BEGIN_ANEW_S = 1.0
+
+_log = structlog.get_logger(__name__)
+
+
+class LastingThread(threading.Thread):
+    """A thread that lasts as long as a service. An error that ends its loop is logged, and the loop begun anew."""
+
+    def __init__(self, loop: Callable[[], None], name: str) -> None:
+        super().__init__(name=name, daemon=True)
+        self._loop = loop
+
+    def run(self) -> None:
+        """See `threading.Thread`."""
+        while True:
+            try:
+                return self._loop()
+            except BaseException:  # noqa: BLE001 - whatever it is: work waits for this loop
+                _log.exception("a loop ended by an error, and is begun anew", thread=self.name)
+                time.sleep(_BEGIN_ANEW_S)
 
 
 def as_error(raised: BaseException) -> Exception:

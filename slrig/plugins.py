@@ -14,12 +14,14 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import importlib.util
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from slrig.errors import ConfigError
+from slrig.errors import ConfigError, DriverBrokenError, SlrigError, asks_to_end
+from slrig.printable import foreign_text
 
 FORMATS, RECEIVERS, OBSERVERS = "slrig.formats", "slrig.receivers", "slrig.observers"
 
@@ -43,7 +45,11 @@ class FileFormat:
     @property
     def missing(self) -> str | None:
         """The command that installs the library; None if it is installed."""
-        return None if importlib.util.find_spec(self.library) is not None else self.install
+        try:
+            found = importlib.util.find_spec(self.library) is not None
+        except Exception:  # noqa: BLE001 - it imports what the library lies in, which may be broken
+            found = False
+        return None if found else self.install
 
     def matches(self, name: str) -> bool:
         """True if a file of this name has this format.
@@ -56,11 +62,24 @@ class FileFormat:
             return name == self.name
         return name.startswith(before) and name.endswith(after) and len(name) > len(before) + len(after)
 
-    def load(self) -> Callable[..., bytes]:
-        """Import the encoder."""
-        module, _, function = self.encoder.partition(":")
-        encode: Callable[..., bytes] = getattr(importlib.import_module(module), function)
-        return encode
+    def encode(self, *given: object) -> bytes:
+        """Return the file's bytes. Raises SlrigError as the encoder does; DriverBrokenError: it has a defect."""
+        try:
+            module, _, function = self.encoder.partition(":")
+            data: bytes = getattr(importlib.import_module(module), function)(*given)
+            # Raises TypeError for anything else than bytes.
+            memoryview(data)
+        except SlrigError:
+            raise
+        except BaseException as error:
+            if asks_to_end(error):
+                raise
+            message = (
+                f"{self.name}: its encoder {self.encoder} failed ({type(error).__name__}: {foreign_text(error)}); "
+                "report it to the maintainer of its package"
+            )
+            raise DriverBrokenError(message) from error
+        return data
 
 
 @cache
@@ -74,17 +93,28 @@ def load(group: str) -> Mapping[str, Any]:
     """
     objects = {}
     for entry in sorted(importlib.metadata.entry_points(group=group), key=lambda entry: entry.name):
-        try:
-            objects[entry.name] = entry.load()
-        except (Exception, SystemExit) as error:
-            package = "unknown" if entry.dist is None else entry.dist.name
-            cause = f"{type(error).__name__}: {error}"
-            message = (
-                f"{group}: '{entry.name}' of the package '{package}' cannot be loaded: {cause}. Update or uninstall "
-                "that package."
-            )
-            raise ConfigError(message) from error
+        package = "unknown" if entry.dist is None else entry.dist.name
+        with plugin_errors(group, f"{entry.name}' of the package '{package}"):
+            found = objects[entry.name] = entry.load()
+            if not (isinstance(found, FileFormat) if group == FORMATS else callable(found)):
+                message = f"it is {type(found).__name__}, which is not what this group holds"
+                raise TypeError(message)
     return objects
+
+
+@contextmanager
+def plugin_errors(group: str, name: str) -> Iterator[None]:
+    """Have a plug-in that fails within the block be named by a ConfigError. Its own errors of slrig pass."""
+    try:
+        yield
+    except SlrigError:
+        raise
+    except BaseException as error:
+        if asks_to_end(error):
+            raise
+        cause = f"{type(error).__name__}: {foreign_text(error)}"
+        message = f"{group}: '{name}' cannot be loaded: {cause}. Update or uninstall that package."
+        raise ConfigError(message) from error
 
 
 def formats() -> tuple[FileFormat, ...]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, TypeVar
@@ -26,6 +27,7 @@ from slrig.catalogue.store import Copier, catalogue_of, standing
 from slrig.config import ServiceSettings
 from slrig.discovery import DeviceSearch
 from slrig.doctor import EXAMINATIONS, Examinations
+from slrig.failure import LastingThread
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import (
     RIG_JOBS,
@@ -43,7 +45,7 @@ from slrig.jobs.retention import CLOCK, JobArchive, Limits, Retention, SteadyClo
 from slrig.jobs.store import Audit, AuditEntry, JobStore, RequestKeys
 from slrig.model_jobs.job import MODELS, TURNTABLE, Models, ViewShooting
 from slrig.model_jobs.turntable import TurntableStore
-from slrig.plugins import OBSERVERS, load
+from slrig.plugins import OBSERVERS, load, plugin_errors
 from slrig.scan.plan import Presets
 from slrig.schedule.notices import NoticedHealth, senders_of, tell_run
 from slrig.schedule.scheduler import Scheduler, Tasks
@@ -220,7 +222,11 @@ class Service:
         self.models = Models(manager, turntable=self.turntable, spare_bytes=spare_bytes)
         self.shooting = ViewShooting(self.models, manager)
         self.durations = Durations()
-        self.observers = [each for observe in load(OBSERVERS).values() if (each := observe()) is not None]
+        self.observers: list[Any] = []
+        for name, observe in load(OBSERVERS).items():
+            with plugin_errors(OBSERVERS, name):
+                self.observers.append(observe())
+        self.observers = [each for each in self.observers if each is not None]
         self.calibrations.settle()
         self.acceptance.settle()
         resume(manager)
@@ -280,10 +286,12 @@ class Service:
                 self.store.prune(record.kind, _MOST_ON_RECORD)
             events = self.store.events(record.id, after=0)
             self.durations.ended(record, events)
-            for observer in self.observers:
-                observer.ended(record, events)
-        except (Exception, SystemExit):  # noqa: BLE001 - the job is over, and on record, whatever becomes of its figures
+        except Exception:  # noqa: BLE001 - the job is over, and on record, whatever becomes of its figures
             _log.exception("how long a job took could not be noted", job=str(record.id))
+            return
+        for observer in self.observers:
+            with _logged(observer):
+                observer.ended(record, events)
 
     def start(self) -> None:
         """Open the rig, look at the clock, send what waits, and remove what is old."""
@@ -321,22 +329,24 @@ class Service:
         for sender in self._tellers:
             sender.close()
         for observer in self.observers:
-            observer.close()
+            with _logged(observer):
+                observer.close()
         self.store.database.close()
         self.folder.release()
 
 
+@contextmanager
+def _logged(observer: object) -> Iterator[None]:
+    """Log whatever an observer raises within the block: it is somebody else's, and only looks."""
+    try:
+        yield
+    except BaseException:  # noqa: BLE001 - see above
+        _log.exception("an observer failed", observer=type(observer).__name__)
+
+
 def _lasting_threads() -> frozenset[str]:
     """Names of the threads of this process that last as long as a service, as far as they live."""
-    names = {
-        "slrig-rig",
-        "slrig-watchdog",
-        "slrig-schedule",
-        "slrig-retention",
-        "slrig-notices",
-        "slrig-catalogue",
-    }
-    return frozenset(names.intersection(each.name for each in threading.enumerate() if each.is_alive()))
+    return frozenset(each.name for each in threading.enumerate() if isinstance(each, LastingThread))
 
 
 async def _of_request(request: Request) -> Service:

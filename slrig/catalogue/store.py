@@ -50,6 +50,7 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, aliased, mapped_column
 from slrig.calibrate.verification import RigHealth
 from slrig.config import ServiceSettings, is_loopback
 from slrig.errors import CatalogueError, ConfigError, ExtraMissingError, StorageError
+from slrig.failure import LastingThread
 from slrig.jobs.database import sqlite_engine, upgrade, writing
 from slrig.jobs.manager import JobManager, RigStatus
 from slrig.jobs.records import JobKind, JobState
@@ -517,7 +518,7 @@ class Copier:
         self._told_uncopied = 0
         self._left = threading.Event()
         self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="slrig-catalogue", daemon=True)
+        self._thread = LastingThread(self._run, "slrig-catalogue")
 
     def start(self) -> None:
         """Begin to copy."""

@@ -34,7 +34,7 @@ from slrig.errors import (
     StorageError,
     WorkerLostError,
 )
-from slrig.failure import UNEXPECTED, JobFailure, as_error, interruption_error, job_failure
+from slrig.failure import UNEXPECTED, JobFailure, LastingThread, as_error, interruption_error, job_failure
 from slrig.jobs.data_folder import BUNDLE, DataFolder, read_entries, require_files
 from slrig.jobs.job import FrameFeed, Group, Job, JobRun, Outcome, ProgressRecorder, Recording, due_s
 from slrig.jobs.records import (
@@ -191,7 +191,7 @@ class JobManager:
         self._ending = self._closed = False
         self._closing = threading.Lock()
         self._turns: dict[UUID | None, threading.Lock] = defaultdict(threading.Lock)
-        self._owner = threading.Thread(target=self._own_rig, name="slrig-rig", daemon=True)
+        self._owner = LastingThread(self._own_rig, "slrig-rig")
         self._watchdog = Watchdog(rig.calls, self._give_up_on)
 
     # Requests

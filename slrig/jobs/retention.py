@@ -28,7 +28,7 @@ from slrig.errors import (
     ScanStateError,
     StorageError,
 )
-from slrig.failure import disk_errors
+from slrig.failure import LastingThread, disk_errors
 from slrig.jobs.data_folder import remove
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import Clock, JobKind, JobState, utc_now
@@ -249,7 +249,7 @@ class Retention:
         self._due = threading.Condition()
         self._kinds = set(self._archives)
         self._closed = False
-        self._thread = threading.Thread(target=self._keep_on, name="slrig-retention", daemon=True)
+        self._thread = LastingThread(self._keep_on, "slrig-retention")
 
     def start(self) -> None:
         """Look at all now and every hour, and at a kind after `look`. Does nothing without limits and trash."""

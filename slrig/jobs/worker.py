@@ -252,7 +252,7 @@ def _answer(pipe: Connection, stops: Connection, run: RunTask, pipeline: Any, li
     except (ConnectionError, EOFError):
         # The parent is gone: nobody waits for an answer.
         raise
-    except Exception as error:  # noqa: BLE001 - the traceback travels to the parent, which logs it
+    except BaseException as error:  # noqa: BLE001 - the traceback travels to the parent, which logs it
         return Failed(run.number, job_failure(error), traceback.format_exc())
 
 

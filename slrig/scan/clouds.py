@@ -366,7 +366,7 @@ def cloud_file(
     progress(STAGE, 0.0, "")
     bundle = bundle or folder / BUNDLE
     calibration = calibration or bundle / CALIBRATION
-    encode: Callable[..., bytes] = ENCODERS.get(form) or next(each.load() for each in formats() if each.name == form)
+    encode: Callable[..., bytes] = ENCODERS.get(form) or next(each.encode for each in formats() if each.name == form)
     if "{camera}" not in form:
         return encode(*_whole_scan(folder, bundle, calibration))
     if camera is None:

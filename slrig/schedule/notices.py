@@ -24,10 +24,11 @@ from slrig.calibrate.verification import HealthStore, VerificationRecord
 from slrig.calibration.health import HealthState
 from slrig.config import NoticeKind, ServiceSettings, read_private_text
 from slrig.errors import ConfigError, StorageError
+from slrig.failure import LastingThread
 from slrig.jobs.database import Database
 from slrig.jobs.records import Clock, utc_now
 from slrig.jobs.store import Notice, Outbox
-from slrig.plugins import RECEIVERS, load
+from slrig.plugins import RECEIVERS, load, plugin_errors
 from slrig.schedule.store import RunState, Schedule, ScheduledRun
 
 TOLD: dict[RunState, NoticeKind] = {
@@ -121,7 +122,7 @@ class Sender(ABC):
         self._gone = self._left = False
         self._taken: str | None = None
         self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._send_all, name="slrig-notices", daemon=True)
+        self._thread = LastingThread(self._send_all, f"slrig-notices-{self.receiver}")
 
     @abstractmethod
     def refusal(self, notice: Notice) -> str | None:
@@ -150,7 +151,7 @@ class Sender(ABC):
         if notice.id != self._taken:
             try:
                 cause = self.refusal(notice)
-            except Exception as error:  # noqa: BLE001 - whatever it was, the next try may get through
+            except BaseException as error:  # noqa: BLE001 - whatever it was, the next try may get through
                 cause = type(error).__name__
             if cause is not None:
                 return self._failed(notice, cause)
@@ -274,7 +275,10 @@ def senders_of(settings: ServiceSettings, outbox: Outbox) -> list[Sender]:
     if settings.webhook_url is not None:
         secret, source = secret_of(settings.webhook_secret, settings.webhook_secret_file, "webhook_secret")
         found.append(Webhook(outbox, settings.webhook_url, None if secret is None else signing_key(secret, source)))
-    return [*found, *(open_sender(settings, outbox) for open_sender in _named_receivers(settings).values())]
+    for name, open_sender in _named_receivers(settings).items():
+        with plugin_errors(RECEIVERS, name):
+            found.append(open_sender(settings, outbox))
+    return found
 
 
 def _named_receivers(settings: ServiceSettings) -> Mapping[str, Callable[[ServiceSettings, Outbox], Sender]]:

@@ -36,7 +36,7 @@ from slrig.errors import (
     UnsupportedByDeviceError,
     WorkerLostError,
 )
-from slrig.failure import error_of, job_failure
+from slrig.failure import LastingThread, error_of, job_failure
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import Clock, Holder, JobState, acting_as, utc_now
 from slrig.jobs.store import JobStore
@@ -100,7 +100,7 @@ class Scheduler:
         self._stop = threading.Event()
         self._idle = threading.Event()
         self._idle.set()
-        self._loop = threading.Thread(target=self._look_again, name="slrig-schedule", daemon=True)
+        self._loop = LastingThread(self._look_again, "slrig-schedule")
 
     def start(self) -> None:
         """Record what a process before this one left behind, and look at the clock from now on."""

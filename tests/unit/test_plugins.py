@@ -9,7 +9,7 @@ import pytest
 
 from slrig import plugins
 from slrig.config import ServiceSettings
-from slrig.errors import ConfigError
+from slrig.errors import ConfigError, DriverBrokenError
 from slrig.scan.formats import camera_prefixes, missing_for, on_demand, requested_forms
 from slrig.schedule.notices import wanted_kinds
 
@@ -29,7 +29,7 @@ def test_a_format_of_a_plugin_is_offered_and_names_what_it_needs(entries: list[i
     assert "cloud-{camera}.xyz" in requested_forms()
     assert on_demand("cloud-left.xyz", ["right", "left"]) == ("cloud-{camera}.xyz", "left")
     assert missing_for("cloud-left.xyz") == "pip install xyz"
-    assert FORMAT.load() is encode
+    assert FORMAT.encode("a cloud") == b"xyz"
     assert "cloud-left.xyz".startswith(camera_prefixes())
     # Another file with the same ending needs nothing.
     assert missing_for("points-left.xyz") is None
@@ -41,6 +41,44 @@ def test_a_plugin_that_cannot_be_loaded_is_named(entries: list[importlib.metadat
         plugins.load(plugins.RECEIVERS)
 
 
+@pytest.mark.parametrize(
+    ("group", "target", "words"),
+    [
+        (plugins.RECEIVERS, "ends", "SystemExit: it ended"),
+        (plugins.OBSERVERS, "interrupts", "GeneratorExit"),
+        (plugins.OBSERVERS, "speaks", r"RuntimeError: a\\udcff"),
+        (plugins.FORMATS, "encode", "it is function"),
+        (plugins.RECEIVERS, "FORMAT", "it is FileFormat"),
+    ],
+)
+def test_whatever_loading_a_plugin_raises_or_gives_is_told_in_words(
+    entries: list[importlib.metadata.EntryPoint], group: str, target: str, words: str
+) -> None:
+    errors = {"ends": SystemExit("it ended"), "interrupts": GeneratorExit(), "speaks": RuntimeError("a\udcff")}
+
+    class Entry(importlib.metadata.EntryPoint):
+        def load(self) -> object:
+            if target in errors:
+                raise errors[target]
+            return globals()[target]
+
+    entries.append(Entry("odd", "m:f", group))
+    with pytest.raises(ConfigError, match=rf"{group}: 'odd' of the package 'unknown' cannot be loaded: .*{words}"):
+        plugins.load(group)
+
+
+@pytest.mark.parametrize("given", [SystemExit(3), GeneratorExit(), ValueError("\udcff"), None, "text"])
+def test_an_encoder_with_a_defect_is_named(monkeypatch: pytest.MonkeyPatch, given: object) -> None:
+    def odd(_cloud: object) -> object:
+        if isinstance(given, BaseException):
+            raise given
+        return given
+
+    monkeypatch.setitem(globals(), "encode", odd)
+    with pytest.raises(DriverBrokenError, match=r"cloud-\{camera\}\.xyz: its encoder .*:encode failed"):
+        FORMAT.encode("a cloud")
+
+
 def test_a_receiver_that_settings_name_is_not_left_out_in_silence(
     entries: list[importlib.metadata.EntryPoint],
 ) -> None:
@@ -50,7 +88,7 @@ def test_a_receiver_that_settings_name_is_not_left_out_in_silence(
 
 
 def encode(_cloud: object) -> bytes:
-    return b""
+    return b"xyz"
 
 
 FORMAT = plugins.FileFormat(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
 from starlette.types import Message, Receive, Scope, Send
+from structlog.testing import capture_logs
 
 from slrig.api import service as latency
 from slrig.api.service import Durations, Latency
@@ -27,6 +29,7 @@ from tests.unit.api.conftest import ServedBench, client_of, ended
 from tests.unit.api.test_access import PATHS, filled
 from tests.unit.command import done, refused, slrig
 from tests.unit.jobs.tame_compute import TameCompute
+from tests.unit.scan.fakes import WAIT_S
 
 ANSWERS, JOBS, STAGES = (
     "slrig_http_response_start_seconds",
@@ -143,6 +146,30 @@ def test_probes_say_what_is_missing(client: TestClient, served: ServedBench, mon
         assert (ready.status_code, ready.json()["checks"]["reconstruction"]) == (503, condition)
         assert ready.json()["pending"] == pending
         assert f"reconstruction: {condition}" in ready.json()["detail"]
+
+
+def test_an_observer_that_fails_keeps_nothing_from_the_others(client: TestClient, served: ServedBench) -> None:
+    told = threading.Event()
+
+    class Odd:
+        def ended(self, *_: object) -> None:
+            raise SystemExit(3)
+
+        close = ended
+
+    class Whole:
+        def ended(self, *_: object) -> None:
+            told.set()
+
+        def close(self) -> None:
+            return
+
+    served.service.observers[:] = [Odd(), Whole()]
+    with capture_logs() as logs:
+        ended(client, client.post("/scan").json()["id"])
+        assert told.wait(WAIT_S)
+    assert [line["observer"] for line in logs if line["event"] == "an observer failed"] == ["Odd"]
+    assert client.get("/readyz").status_code == 200
 
 
 def test_service_whose_data_folder_is_gone_says_so(tmp_path: Path) -> None:
