@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,9 @@ from slrig.devices import (
     ScannerHead,
     Synchronisation,
     SystemClock,
+    require_camera_info,
+    require_found,
+    require_projector_info,
 )
 from slrig.errors import (
     ConfigError,
@@ -49,8 +53,10 @@ from slrig.errors import (
     RigBusyError,
     SlrigError,
     WrongSystemError,
+    asks_to_end,
 )
 from slrig.model import Calibration, require_plausible
+from slrig.printable import foreign_text
 
 GROUPS: Mapping[str, str] = {
     "camera": "slrig.cameras",
@@ -129,19 +135,55 @@ def discover_devices() -> DiscoveredDevices:
     elsewhere: list[OtherSystem] = []
     for entry in sorted(importlib.metadata.entry_points(group=GROUPS["finder"]), key=lambda entry: entry.name):
         try:
-            finder = _load("finder", entry)
-            with _convert_driver_errors("finder", entry.name, {}):
-                devices.extend(_check_devices(entry.name, finder()))
+            devices.extend(_found_by(entry))
         except LibraryMissingError as error:
-            missing.append(MissingLibrary(entry.name, error.install, str(error)))
+            missing.append(MissingLibrary(entry.name, foreign_text(error.install), foreign_text(error)))
         except WrongSystemError as error:
-            elsewhere.append(OtherSystem(entry.name, str(error)))
-        except DriverBrokenError as error:
-            faults.append(error)
+            elsewhere.append(OtherSystem(entry.name, foreign_text(error)))
         except SlrigError as error:
-            message = f"finder '{entry.name}' failed: {error}"
-            faults.append(DriverBrokenError(message))
+            told = foreign_text(error)
+            named = isinstance(error, DriverBrokenError) and entry.name in told
+            faults.append(DriverBrokenError(told if named else f"finder '{entry.name}' failed: {told}"))
     return DiscoveredDevices(tuple(devices), tuple(missing), tuple(faults), tuple(elsewhere))
+
+
+FINDER_LIMIT_S = 30.0
+"""How long a finder may look. One that takes longer is not waited for, nor asked again before it has returned."""
+
+_MAX_FOUND = 1000
+"""Devices of one finder; more is a finder that does not end."""
+
+_looking: dict[str, threading.Thread] = {}
+"""Finders that have not returned, by their names."""
+
+
+def _found_by(entry: importlib.metadata.EntryPoint) -> tuple[FoundDevice, ...]:
+    """Devices of one finder, which looks on a thread of its own. Raises what it raises; DriverBrokenError: it hangs."""
+    finder = _load("finder", entry)
+    found: list[tuple[FoundDevice, ...] | SlrigError] = []
+
+    def look() -> None:
+        try:
+            with _convert_driver_errors(f"finder driver '{entry.name}'", {}):
+                found.append(tuple(require_found(each) for each in islice(finder(), _MAX_FOUND)))
+        except SlrigError as error:
+            found.append(error)
+
+    before = _looking.get(entry.name)
+    if before is None or not before.is_alive():
+        before = _looking[entry.name] = threading.Thread(target=look, name=f"slrig-finder {entry.name}", daemon=True)
+        before.start()
+        before.join(FINDER_LIMIT_S)
+    if not found:
+        message = (
+            f"finder '{entry.name}' has not come back for {FINDER_LIMIT_S:.0f} s, and its devices are not listed; "
+            "unplug them and plug them in again, and report it to the driver's package"
+        )
+        raise DriverBrokenError(message)
+    (result,) = found
+    if isinstance(result, SlrigError):
+        raise result
+    return result
 
 
 _FRESH_S = 5.0
@@ -308,7 +350,7 @@ def _calibration(
 
 def _close_quietly(device: Camera | Projector | Positioner) -> None:
     # The error that caused the closing matters, not those of closing.
-    with suppress(Exception):
+    with suppress(BaseException):
         device.close()
 
 
@@ -326,23 +368,46 @@ def _open(kind: str, table: DriverTable, protocol: type[Any], folder: Path, *nam
         message = f"{kind} driver '{table.driver}' is provided by several packages: {packages}; uninstall all but one"
         raise DriverBrokenError(message)
     factory = _load(kind, entries[0])
-    with _convert_driver_errors(kind, table.driver, table.options), _convert_os_errors(kind, table.driver):
-        device = factory(*name, table.options, folder)
-        if not isinstance(device, protocol):
-            raise DriverBrokenError(
-                f"{kind} driver '{table.driver}' returned {type(device).__name__}, which is not a {protocol.__name__}"
-            )
+    label = "".join(f"{kind} '{each}': " for each in name) + f"{kind} driver '{table.driver}'"
+    with ExitStack() as opened:
+        with _convert_driver_errors(label, table.options, " to open its device"), _convert_os_errors(label):
+            device = factory(*name, table.options, folder)
+            if hasattr(device, "close"):
+                opened.callback(_close_quietly, device)
+        # That asks the device for all that it declares.
+        with _convert_driver_errors(label, table.options, " in info"):
+            if not isinstance(device, protocol):
+                raise DriverBrokenError(
+                    f"{label} opened its device and returned {type(device).__name__}, which is not a "
+                    f"{protocol.__name__}; report it to the driver's package"
+                )
+            _require_described(kind, device)
+        opened.pop_all()
         return device
+
+
+def _require_described(kind: str, device: Any) -> None:
+    """Raise TypeError or ValueError where what a device declares is nothing that a device has."""
+    if kind == "camera":
+        require_camera_info(device.info)
+    elif kind == "projector":
+        require_projector_info(device.info)
+    elif kind == "head":
+        _require_described("projector", device.projector)
+        for camera in device.cameras.values():
+            _require_described("camera", camera)
 
 
 def _load(kind: str, entry: importlib.metadata.EntryPoint) -> Callable[..., Any]:
     package, version = _package_version(entry)
     try:
         factory = entry.load()
-    except (Exception, SystemExit) as cause:  # importing a package must not end the service
+    except BaseException as cause:  # importing a package must not end the service
+        if asks_to_end(cause):
+            raise
         raise DriverBrokenError(
             f"{kind} driver '{entry.name}' of {package} {version} cannot be loaded ({entry.value}): "
-            f"{type(cause).__name__}: {cause}; install what it needs or uninstall it"
+            f"{type(cause).__name__}: {foreign_text(cause)}; install what it needs or uninstall it"
         ) from cause
     if not callable(factory):
         raise DriverBrokenError(
@@ -353,40 +418,33 @@ def _load(kind: str, entry: importlib.metadata.EntryPoint) -> Callable[..., Any]
 
 
 @contextmanager
-def _convert_os_errors(kind: str, name: str) -> Iterator[None]:
+def _convert_os_errors(label: str) -> Iterator[None]:
     """Convert an error of the operating system while a device is opened to a fault of the device, not of its driver."""
     try:
         yield
     except OSError as cause:
         raise DeviceError(
-            f"{kind} driver '{name}' failed to open its device: {cause}; check cable, power and permissions, and that "
-            "no other program holds it"
+            f"{label} failed to open its device: {foreign_text(cause)}; check cable, power and "
+            "permissions, and that no other program holds it"
         ) from cause
 
 
 @contextmanager
-def _convert_driver_errors(kind: str, name: str, options: Mapping[str, object]) -> Iterator[None]:
-    """Convert the errors of a driver's factory to errors of slrig with the driver's name and kind."""
+def _convert_driver_errors(label: str, options: Mapping[str, object], doing: str = "") -> Iterator[None]:
+    """Convert the errors of a driver's factory to errors of slrig with the driver's name and kind, its `label`."""
     try:
         yield
     except SlrigError:
         raise
     except ValidationError as cause:
-        message = f"{kind} driver '{name}' refuses these options:\n{describe_errors(cause, options, ())}"
+        message = f"{label} refuses these options:\n{describe_errors(cause, options, ())}"
         raise ConfigError(message) from cause
-    except (Exception, SystemExit) as cause:
-        message = f"{kind} driver '{name}' failed: {type(cause).__name__}: {cause}; report it to the driver's package"
+    except BaseException as cause:
+        if asks_to_end(cause):
+            raise
+        told = f"{type(cause).__name__}: {foreign_text(cause)}"
+        message = f"{label} failed{doing}: {told}; report it to the driver's package"
         raise DriverBrokenError(message) from cause
-
-
-def _check_devices(name: str, found: Any) -> tuple[FoundDevice, ...]:
-    devices = tuple(found)
-    strange = sorted({type(each).__name__ for each in devices if not isinstance(each, FoundDevice)})
-    if strange:
-        raise DriverBrokenError(
-            f"finder '{name}' returned {', '.join(strange)} instead of FoundDevice; report it to the driver's package"
-        )
-    return devices
 
 
 def _package_version(entry: importlib.metadata.EntryPoint) -> tuple[str, str]:
@@ -427,10 +485,12 @@ def option_model(driver: str) -> type[BaseModel] | None:
         raise DriverBrokenError(message)
     try:
         model: object = entries[0].load()
-    except (Exception, SystemExit) as cause:  # importing a package must not end the command
+    except BaseException as cause:  # importing a package must not end the command
+        if asks_to_end(cause):
+            raise
         message = (
             f"the options of driver '{driver}' of {packages} cannot be loaded ({entries[0].value}): "
-            f"{type(cause).__name__}: {cause}; report it there"
+            f"{type(cause).__name__}: {foreign_text(cause)}; report it there"
         )
         raise DriverBrokenError(message) from cause
     if not (isinstance(model, type) and issubclass(model, BaseModel)):

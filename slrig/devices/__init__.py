@@ -13,6 +13,18 @@ from slrig.devices.camera import (
     listen_for_progress,
     progress_reporter,
 )
+from slrig.devices.checks import (
+    require_applied,
+    require_camera_info,
+    require_colour,
+    require_displayed,
+    require_found,
+    require_frame,
+    require_kind,
+    require_number,
+    require_projector_info,
+    require_texts,
+)
 from slrig.devices.projector import (
     DisplayedPattern,
     Projector,
@@ -64,4 +76,14 @@ __all__ = [
     "UnknownPolarityProjector",
     "listen_for_progress",
     "progress_reporter",
+    "require_applied",
+    "require_camera_info",
+    "require_colour",
+    "require_displayed",
+    "require_found",
+    "require_frame",
+    "require_kind",
+    "require_number",
+    "require_projector_info",
+    "require_texts",
 ]

@@ -218,16 +218,16 @@ class Rig:
         """Return the ground truth of a rendered scene; None for real hardware."""
         return self.head.truth() if self.head is not None else None
 
-    def close(self) -> tuple[Exception, ...]:
+    def close(self) -> tuple[BaseException, ...]:
         """Switch the light off, then close every device in any state. Return the exceptions that they raised."""
-        faults: list[Exception] = []
+        faults: list[BaseException] = []
         steps: list[Callable[[], None]] = [self.projector.blank, self.projector.close]
         if self.positioner is not None:
             steps.append(self.positioner.close)
         for step in (*steps, *(camera.close for camera in self.cameras.values())):
             try:
                 step()
-            except Exception as error:  # noqa: BLE001 - a driver may raise anything; close the other devices too
+            except BaseException as error:  # noqa: BLE001 - a driver may raise anything; close the other devices too
                 faults.append(error)
         return tuple(faults)
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Generic, TypeVar
 
-import numpy as np
 import structlog
 
 from slrig.capture import differs_from_request
@@ -23,17 +22,25 @@ from slrig.devices import (
     DEFAULT_LIMITS,
     AppliedSettings,
     Camera,
-    CameraInfo,
     CameraSettings,
+    Clock,
     DisplayedPattern,
     Positioner,
     Projector,
-    ProjectorInfo,
     Rig,
     Trigger,
     Turntable,
     UnknownPolarityProjector,
     listen_for_progress,
+    require_applied,
+    require_camera_info,
+    require_colour,
+    require_displayed,
+    require_frame,
+    require_kind,
+    require_number,
+    require_projector_info,
+    require_texts,
 )
 from slrig.errors import (
     DeviceBusyError,
@@ -44,6 +51,7 @@ from slrig.errors import (
     SlrigError,
     UnsupportedByDeviceError,
 )
+from slrig.failure import JobFailure, LastingThread, error_of
 from slrig.model import Frame, PatternSequence, RotationAxis
 from slrig.printable import foreign_text
 
@@ -164,12 +172,13 @@ class Calls:
         try:
             with listen_for_progress(heard):
                 value = function()
-        except SlrigError as error:
+        except SlrigError as raised:
+            error = _plain(raised)
             # Whoever opens a device names it; and capture tells of a frame that did not come in words of its own.
             if isinstance(error, DeviceError) and not isinstance(error, FrameTimeoutError) and step != OPEN:
                 error.place = f"{device}, in {step}"
             self._note(error)
-            raise
+            raise error from raised.__cause__
         except OSError as error:
             found = _of_the_system(error, call)
             self._note(found)
@@ -237,7 +246,7 @@ class Watchdog:
         self._on_hang = on_hang
         self._look_s = look_s
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="slrig-watchdog", daemon=True)
+        self._thread = LastingThread(self._watch, "slrig-watchdog")
 
     def start(self) -> None:
         """Begin to look."""
@@ -263,16 +272,18 @@ def guarded(rig: Rig, calls: Calls, settings: dict[str, SettingsInUse]) -> Rig:
     """
     return replace(
         rig,
-        cameras={name: _GuardedCamera(camera, name, calls, settings) for name, camera in rig.cameras.items()},
-        projector=_guarded_projector(rig.projector, calls),
+        cameras={
+            name: _GuardedCamera(camera, name, calls, settings, rig.clock) for name, camera in rig.cameras.items()
+        },
+        projector=_guarded_projector(rig.projector, calls, rig.clock),
         positioner=_guarded_positioner(rig.positioner, calls),
     )
 
 
-def _guarded_projector(projector: Projector, calls: Calls) -> Projector:
+def _guarded_projector(projector: Projector, calls: Calls, clock: Clock) -> Projector:
     if isinstance(projector, UnknownPolarityProjector):
-        return _GuardedUnknownPolarityProjector(projector, calls)
-    return _GuardedProjector(projector, calls)
+        return _GuardedUnknownPolarityProjector(projector, calls, clock)
+    return _GuardedProjector(projector, calls, clock)
 
 
 def _guarded_positioner(positioner: Positioner | None, calls: Calls) -> GuardedPositioner | None:
@@ -288,6 +299,7 @@ class _Guarded(Generic[_Device]):
         self._device = device
         self._name = name
         self._calls = calls
+        self._limits = DEFAULT_LIMITS
 
     def close(self) -> None:
         self._made("close", self._device.close)
@@ -297,39 +309,24 @@ class _Guarded(Generic[_Device]):
         limit_s = limits.call_s if limit_s is None else limit_s
         return self._calls.make(self._name, step, limit_s, function, computed=limits.computed)
 
-    def _returned(
-        self, step: str, kind: type[_Value], function: Callable[[], object], *, limit_s: float | None = None
-    ) -> _Value:
-        """Make a call that must return a value of a kind; anything else is a defect of the driver."""
-
-        def checked() -> _Value:
-            value = function()
-            if not isinstance(value, kind):
-                message = f"it returned {foreign_text(repr(value))[:80]}, a {kind.__name__} is expected"
-                raise TypeError(message)
-            return value
-
-        return self._made(step, checked, limit_s=limit_s)
-
-    def _read_info(self, kind: type[_Value]) -> _Value:
-        """What the device declares; read once, as it does not change."""
-        self._limits = DEFAULT_LIMITS
-        return self._returned("info", kind, lambda: self._device.info)
-
 
 class _GuardedCamera(_Guarded[Camera]):
     """Implements `slrig.devices.Camera` by another one."""
 
-    def __init__(self, camera: Camera, name: str, calls: Calls, settings: dict[str, SettingsInUse]) -> None:
+    def __init__(
+        self, camera: Camera, name: str, calls: Calls, settings: dict[str, SettingsInUse], clock: Clock
+    ) -> None:
         super().__init__(camera, f"camera '{name}'", calls)
         self._key = name
         self._settings = settings
-        self.info = self._read_info(CameraInfo)
+        self._clock = clock
+        # It does not change.
+        self.info = self._made("info", lambda: require_camera_info(camera.info))
         self._limits = self.info.limits
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         try:
-            applied = self._returned("configure", AppliedSettings, lambda: self._device.configure(settings))
+            applied = self._made("configure", lambda: require_applied(self._device.configure(settings)))
         except UnsupportedByDeviceError as error:
             before = self._settings.get(self._key)
             kept = None if before is None else before.applied
@@ -349,52 +346,37 @@ class _GuardedCamera(_Guarded[Camera]):
 
         def read() -> Frame:
             frame = self._device.read(after_ns, timeout_s)
-            _require_possible(frame)
-            return frame
+            return require_frame(frame, self.info.name, self._clock.now_ns())
 
-        return self._returned("read", Frame, read, limit_s=limit_s)
+        frame = self._made("read", read, limit_s=limit_s)
+        colour = frame.colour
+        if colour is None:
+            return frame
+        return replace(frame, colour=lambda: self._made("read", lambda: require_colour(colour(), frame)))
 
     def disarm(self) -> None:
         self._made("disarm", self._device.disarm)
 
 
-def _require_possible(frame: object) -> None:
-    """Raise ValueError for times and counts that no camera has."""
-    if not isinstance(frame, Frame):
-        return
-    counts: tuple[object, ...] = (
-        frame.t_start_ns, frame.t_end_ns, frame.t_err_ns, frame.sequence_number, frame.dropped_count
-    )  # fmt: skip
-    whole = all(isinstance(each, int | np.integer) and abs(int(each)) < 2**62 for each in counts)
-    if not whole or frame.t_end_ns < frame.t_start_ns or frame.t_err_ns < 0 or not 0 <= frame.dropped_count < 2**31:
-        message = (
-            f"it returned a frame from {frame.t_start_ns} to {frame.t_end_ns} ns ± {frame.t_err_ns}, number "
-            f"{frame.sequence_number}, {frame.dropped_count} lost before, which no exposure has"
-        )
-        raise ValueError(message)
-
-
 class _GuardedProjector(_Guarded[Projector]):
     """Implements `slrig.devices.Projector` by another one."""
 
-    def __init__(self, projector: Projector, calls: Calls) -> None:
+    def __init__(self, projector: Projector, calls: Calls, clock: Clock) -> None:
         super().__init__(projector, "projector", calls)
-        self.info = self._read_info(ProjectorInfo)
+        self._clock = clock
+        self.info = self._made("info", lambda: require_projector_info(projector.info))
         self._limits = self.info.limits
-        self._name = f"projector '{foreign_text(self.info.name)}'"
+        self._name = f"projector '{self.info.name}'"
 
     def load(self, sequence: PatternSequence) -> None:
         self._made("load", lambda: self._device.load(sequence))
 
     def show(self, index: int) -> DisplayedPattern:
-        def show() -> object:
-            shown: object = self._device.show(index)
-            if isinstance(shown, DisplayedPattern) and not (shown.index == index and shown.t_err_ns >= 0):
-                message = f"asked for pattern {index}, it returned {shown}"
-                raise ValueError(message)
-            return shown
+        def show() -> DisplayedPattern:
+            shown = self._device.show(index)
+            return require_displayed(shown, index, self._clock.now_ns())
 
-        return self._returned("show", DisplayedPattern, show)
+        return self._made("show", show)
 
     def play(self, exposure_s: float, period_s: float) -> None:
         self._made("play", lambda: self._device.play(exposure_s, period_s))
@@ -409,23 +391,25 @@ class _GuardedProjector(_Guarded[Projector]):
 class _GuardedUnknownPolarityProjector(_GuardedProjector):
     """Implements `slrig.devices.UnknownPolarityProjector` by another one."""
 
-    def __init__(self, projector: UnknownPolarityProjector, calls: Calls) -> None:
-        super().__init__(projector, calls)
+    def __init__(self, projector: UnknownPolarityProjector, calls: Calls, clock: Clock) -> None:
+        super().__init__(projector, calls, clock)
         self._projector = projector
 
     @property
     def is_polarity_unknown(self) -> bool:
-        return self._projector.is_polarity_unknown
+        return self._made("is_polarity_unknown", lambda: require_kind(self._projector.is_polarity_unknown, bool))
 
     @property
     def light_period_s(self) -> float:
-        return self._projector.light_period_s
+        return self._made(
+            "light_period_s", lambda: require_number(self._projector.light_period_s, "a period", least=1e-9)
+        )
 
     def set_trial_current(self, share: float) -> None:
         self._made("set_trial_current", lambda: self._projector.set_trial_current(share))
 
     def polarity_option(self, *, rises: bool) -> str:
-        return self._projector.polarity_option(rises=rises)
+        return self._made("polarity_option", lambda: require_texts([self._projector.polarity_option(rises=rises)])[0])
 
 
 class GuardedPositioner:
@@ -435,10 +419,13 @@ class GuardedPositioner:
         self._positioner = positioner
         self._made = partial(calls.make, "the positioner")
 
+    def _told(self, step: str, function: Callable[[], _Value]) -> _Value:
+        return self._made(step, DEFAULT_LIMITS.call_s, function)
+
     @property
     def poses(self) -> Sequence[str]:
         """See `Positioner`."""
-        return self._positioner.poses
+        return self._told("poses", lambda: require_texts(self._positioner.poses))
 
     def move(self, index: int) -> None:
         """See `Positioner`."""
@@ -459,21 +446,50 @@ class GuardedTurntable(GuardedPositioner):
     @property
     def axis(self) -> RotationAxis | None:
         """See `Turntable`."""
-        return self._turntable.axis
+
+        def axis() -> RotationAxis | None:
+            found = self._turntable.axis
+            return None if found is None else require_kind(found, RotationAxis)
+
+        return self._told("axis", axis)
 
     @property
     def angles_deg(self) -> Sequence[float]:
         """See `Turntable`."""
-        return self._turntable.angles_deg
+
+        def angles_deg() -> Sequence[float]:
+            return tuple(require_number(each, _ANGLE) for each in self._turntable.angles_deg)
+
+        return self._told("angles_deg", angles_deg)
 
     @property
     def opened_at_deg(self) -> float | None:
         """See `Turntable`."""
-        return self._turntable.opened_at_deg
+
+        def opened_at_deg() -> float | None:
+            found = self._turntable.opened_at_deg
+            return None if found is None else require_number(found, _ANGLE)
+
+        return self._told("opened_at_deg", opened_at_deg)
 
     def turn(self, angle_deg: float) -> None:
         """See `Turntable`."""
         self._made("turn", MOVE_LIMIT_S, lambda: self._turntable.turn(angle_deg))
+
+
+_ANGLE = "an angle"
+
+
+def _plain(error: SlrigError) -> SlrigError:
+    """The same error, of a class of slrig's own, with a text that is safe to print."""
+    own = (each for each in type(error).__mro__ if each.__module__ == SlrigError.__module__)
+    kind = next(each for each in own if issubclass(each, SlrigError))
+    # Not `str`, which adds the place where it was raised before.
+    text = foreign_text(error.args[0] if len(error.args) == 1 else error.args or "")
+    if type(error) is kind:
+        error.args = (text,)
+        return error
+    return error_of(JobFailure(kind.code, foreign_text(error)))
 
 
 def _trace(error: BaseException) -> list[str]:
@@ -485,17 +501,16 @@ def _trace(error: BaseException) -> list[str]:
 
 def _of_the_system(error: OSError, call: Call) -> DeviceError:
     """What the system told a driver, in words that a person can act on."""
-    device, step = call.device, call.step
+    device, step, told = call.device, call.step, foreign_text(error)
+    number = error.errno if isinstance(error.errno, int) else None
     if call.computed:
-        return DeviceError(
-            f"{device} failed in {step}: {error}; check its files and their permissions, then scan again"
-        )
-    if error.errno == errno.EBUSY:
+        return DeviceError(f"{device} failed in {step}: {told}; check its files and their permissions, then scan again")
+    if number == errno.EBUSY:
         return DeviceBusyError(
-            f"{device} is held by another program (in {step}: {error}); end that program, then scan again"
+            f"{device} is held by another program (in {step}: {told}); end that program, then scan again"
         )
-    if error.errno in _GONE:
+    if number in _GONE:
         return DeviceGoneError(
-            f"{device} is gone (in {step}: {error}); check its cable and power, plug it in, then scan again"
+            f"{device} is gone (in {step}: {told}); check its cable and power, plug it in, then scan again"
         )
-    return DeviceError(f"{device} failed in {step}: {error}; check cable, power and permissions, then scan again")
+    return DeviceError(f"{device} failed in {step}: {told}; check cable, power and permissions, then scan again")

@@ -182,7 +182,7 @@ def test_a_scan_with_the_example_beside_broken_plug_ins_is_a_plane_at_its_distan
     ("driver", "told"),
     [
         ("broken_import", "cannot be loaded (slrig_broken_import:open_camera): RuntimeError"),
-        ("broken_factory", "camera driver 'broken_factory' failed: KeyError: 'no handle for left'"),
+        ("broken_factory", "camera driver 'broken_factory' failed to open its device: KeyError: 'no handle for left'"),
         ("lacking", "run: pip install 'slrig-lacking-library[vendor]'"),
     ],
 )

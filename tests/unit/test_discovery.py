@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import itertools
 import re
-from collections.abc import Mapping
+import threading
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import NoReturn
@@ -297,7 +300,7 @@ def test_faults_of_several_tables_are_reported_together_and_all_is_closed(tmp_pa
     ("driver", "error", "part"),
     [
         ("lost", DeviceGoneError, "right is not there"),
-        ("crashing", DriverBrokenError, "'crashing' failed: ZeroDivisionError: right; report it"),
+        ("crashing", DriverBrokenError, "'crashing' failed to open its device: ZeroDivisionError: right; report it"),
         ("broken", DriverBrokenError, r"of fake_drivers 1\.2 cannot be loaded \(no_such_module:open_camera\)"),
         ("constant", DriverBrokenError, "cannot be called"),
         ("nothing", DriverBrokenError, "returned tuple, which is not a Camera"),
@@ -344,6 +347,84 @@ def test_a_failing_finder_does_not_hide_the_devices_of_others() -> None:
     findings = discover_devices()
     assert FoundDevice("fake", "usb-1", "a fake camera") in findings.devices
     assert ["finder driver 'lost' failed: OSError: no bus" in str(fault) for fault in findings.faults] == [True]
+
+
+class WordlessError(BaseException):
+    """An error that has no text."""
+
+    def __str__(self) -> str:
+        raise SystemExit(3)
+
+
+def raising(error: BaseException) -> Callable[[], object]:
+    def find() -> object:
+        raise error
+
+    return find
+
+
+@pytest.fixture
+def finders(monkeypatch: pytest.MonkeyPatch) -> dict[str, Callable[[], object]]:
+    """Finders in place of the installed ones, by name."""
+    found: dict[str, Callable[[], object]] = {"whole": lambda: [FoundDevice("whole", "usb-1", "a camera\x1b[2J")]}
+
+    class Entry(importlib.metadata.EntryPoint):
+        def load(self) -> object:
+            return found[self.name]
+
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: [Entry(name, "m:f", group) for name in found])
+    return found
+
+
+@pytest.mark.parametrize(
+    ("find", "words"),
+    [
+        (raising(SystemExit(3)), "SystemExit: 3"),
+        (raising(KeyboardInterrupt()), "KeyboardInterrupt"),
+        (raising(WordlessError()), "WordlessError"),
+        (raising(RuntimeError("/dev/\udcff")), "RuntimeError: /dev/\\udcff"),
+        (raising(RuntimeError("x" * 10**6)), "RuntimeError: xxx"),
+        (raising(DeviceError("no \udcff bus")), "no \\udcff bus"),
+        (lambda: None, "TypeError"),
+        (lambda: ["usb-1"], "a FoundDevice is expected"),
+        (lambda: [FoundDevice("odd", 5, "a camera")], "a str is expected"),  # type: ignore[arg-type]
+        (lambda: itertools.repeat(5), "a FoundDevice is expected"),
+    ],
+)
+def test_whatever_a_finder_does_is_told_in_words_and_hides_no_other(
+    finders: dict[str, Callable[[], object]], find: Callable[[], object], words: str
+) -> None:
+    finders["odd"] = find
+    found = discover_devices()
+    assert found.devices == (FoundDevice("whole", "usb-1", "a camera\\u001b[2J"),)
+    (fault,) = found.faults
+    assert "odd" in str(fault)
+    assert words in str(fault)
+    assert len(str(fault)) < 3000
+    str(fault).encode()
+
+
+def test_a_finder_that_hangs_is_left_behind_until_it_returns(
+    finders: dict[str, Callable[[], object]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(discovery, "FINDER_LIMIT_S", 0.01)
+    calls, go = list[int](), threading.Event()
+
+    def find() -> object:
+        calls.append(1)
+        go.wait()
+        return ()
+
+    finders["odd"] = find
+    for _ in range(2):
+        found = discover_devices()
+        assert len(found.devices) == 1
+        assert "finder 'odd' has not come back" in str(found.faults[0])
+    assert len(calls) == 1
+    go.set()
+    discovery._looking["odd"].join()
+    monkeypatch.setattr(discovery, "FINDER_LIMIT_S", 30.0)
+    assert discover_devices().faults == ()
 
 
 def test_devices_are_searched_once_for_all_who_ask_and_never_beside_a_job(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,8 @@ from slrig.client import Client
 from tests.e2e.conftest import ServiceProcess, scanned
 from tests.e2e.faulty_rig.service import Desk, serve
 
+HASTY_S = 2.0
+
 
 @dataclass(frozen=True, slots=True)
 class Stand:
@@ -33,7 +35,10 @@ def stands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str],
         def stand(trigger: str) -> Stand:
             if trigger not in made:
                 desk = leaving.enter_context(Desk())
-                service = serve(tmp_path_factory.mktemp(trigger), desk, trigger)
+                # "hasty" : as by software, with limits that a test can wait for.
+                hasty = trigger == "hasty"
+                way, call_s = ("software", HASTY_S) if hasty else (trigger, 0.0)
+                service = serve(tmp_path_factory.mktemp(trigger), desk, way, call_s=call_s)
                 leaving.callback(service.kill)
                 made[trigger] = Stand(desk, service, leaving.enter_context(service.client()))
                 assert scanned(made[trigger].client)["state"] == "succeeded", service.log.read_text()

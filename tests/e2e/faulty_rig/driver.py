@@ -15,22 +15,26 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from slrig.bundle.validation import Strict
 from slrig.devices import (
+    DEFAULT_LIMITS,
     AppliedSettings,
+    CallLimits,
     Camera,
     CameraInfo,
     CameraSettings,
     DisplayedPattern,
+    Positioner,
     Projector,
     ProjectorInfo,
     Trigger,
+    TurntableBase,
 )
 from slrig.errors import (
     DeviceBusyError,
@@ -40,7 +44,18 @@ from slrig.errors import (
     FrameTimeoutError,
     UnsupportedByDeviceError,
 )
-from slrig.model import Calibration, CameraFormat, FloatArray, Frame, PatternSequence, Pinhole, Pixels, Size
+from slrig.model import (
+    Calibration,
+    CameraFormat,
+    FloatArray,
+    Frame,
+    PatternSequence,
+    Pinhole,
+    Pixels,
+    RotationAxis,
+    Size,
+)
+from tests.e2e.faulty_rig.foreign import RAISED, RETURNED
 
 PROJECTOR = Size(64, 48)
 CAMERA = Size(96, 72)
@@ -88,17 +103,21 @@ def _spread() -> FloatArray:
 
 
 _SPREAD = _spread()
+_Device = TypeVar("_Device")
 
 
-PLAYER = "projector"
+PLAYER, TABLE = "projector", "positioner"
 
 
 class Options(Strict):
-    """The driver's keys of a rig file. desk : the socket to ask; trigger : of the camera; plays : of the projector."""
+    """The driver's keys of a rig file. desk : the socket to ask; trigger : of the camera; plays : of the projector.
+    call_s : the limit of each call, 0 for the usual ones.
+    """
 
     desk: str
     trigger: str = Trigger.SOFTWARE
     plays: bool = False
+    call_s: float = 0.0
 
 
 class Line:
@@ -140,6 +159,7 @@ class Handle:
         self.line = line
         self._gone = False
         self.closed = False
+        self._spoil: Callable[[Any], Any] | None = None
         if name in _OPEN:
             raise DeviceBusyError(f"{name} is held by this service itself")
         self.step("open")
@@ -149,10 +169,26 @@ class Handle:
         """Ask whether a step may be done, and meet the fault that it is to meet."""
         answer = "unplug" if self._gone else self.line.say(device=self.name, step=step, number=number)
         self._gone = answer == "unplug"
-        if answer != "go":
+        if answer in RETURNED:
+            self._spoil = RETURNED[answer]
+        elif answer != "go":
             raise self._fault(answer, step)
 
-    def _fault(self, what: str, step: str) -> Exception:
+    def returned(self, value: Any) -> Any:
+        """What the step that was done last is to return: the value, or what no device has."""
+        spoil, self._spoil = self._spoil, None
+        return value if spoil is None else spoil(value)
+
+    def declared(self, value: Any, step: str = "info") -> Any:
+        """The same for what can be asked of a device in every state."""
+        answer = self.line.say(device=self.name, step=step, number=0)
+        if answer in RAISED:
+            raise RAISED[answer]()
+        return RETURNED[answer](value) if answer in RETURNED else value
+
+    def _fault(self, what: str, step: str) -> BaseException:
+        if what in RAISED:
+            return RAISED[what]()
         match what, step:
             case "unplug", _:
                 return DeviceGoneError(f"{self.name} was unplugged; plug it in, then scan again")
@@ -197,14 +233,21 @@ class FaultyCamera:
         self._triggered_ns: int | None = None
         self._count = self._read = 0
         self._pace = threading.Event()
-        form = CameraFormat(CAMERA, 8)
-        self.info = CameraInfo(name, "faulty camera", "c1", form, frozenset({self._way}), (0.001, 1.0), (1.0, 4.0))
+        limits = CallLimits(options.call_s, options.call_s) if options.call_s else DEFAULT_LIMITS
+        form, ways = CameraFormat(CAMERA, 8), frozenset({self._way})
+        self._info = CameraInfo(name, "faulty camera", "c1", form, ways, (0.001, 1.0), (1.0, 4.0), limits)
+
+    @property
+    def info(self) -> CameraInfo:
+        info: CameraInfo = self._handle.declared(self._info)
+        return info
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         self._handle.require_open()
         self._handle.step("configure")
         self._exposure_s = settings.exposure_s
-        return AppliedSettings(settings.exposure_s, settings.gain)
+        applied: AppliedSettings = self._handle.returned(AppliedSettings(settings.exposure_s, settings.gain))
+        return applied
 
     def arm(self, count: int, trigger: Trigger) -> None:
         self._handle.require_open()
@@ -242,7 +285,9 @@ class FaultyCamera:
         self._read += 1
         self._count += 1
         image = photograph(WALL.profile, self._noise)
-        return Frame(self._handle.name, image, start_ns, end_ns, 0, self._count, 0, self._exposure_s, 1.0)
+        frame = Frame(self._handle.name, image, start_ns, end_ns, 0, self._count, 0, self._exposure_s, 1.0)
+        returned: Frame = self._handle.returned(frame)
+        return returned
 
     def disarm(self) -> None:
         if self._armed and not self._handle.closed:
@@ -269,8 +314,14 @@ class FaultyProjector:
     def __init__(self, options: Options) -> None:
         self._handle = Handle(PLAYER, Line(options.desk))
         self._sequence: PatternSequence | None = None
-        self.info = ProjectorInfo(PLAYER, "faulty projector", "p1", PROJECTOR, options.plays, 0.001)
+        limits = CallLimits(options.call_s, options.call_s) if options.call_s else DEFAULT_LIMITS
+        self._info = ProjectorInfo(PLAYER, "faulty projector", "p1", PROJECTOR, options.plays, 0.001, limits=limits)
         self._light(None, "open")
+
+    @property
+    def info(self) -> ProjectorInfo:
+        info: ProjectorInfo = self._handle.declared(self._info)
+        return info
 
     def load(self, sequence: PatternSequence) -> None:
         self._handle.require_open()
@@ -285,11 +336,12 @@ class FaultyProjector:
             raise DeviceStateError(f"asked to show pattern {index}, nothing is loaded")
         self._light(self._sequence.profiles[index], f"show {index}")
         self._handle.step("show", index)
-        return DisplayedPattern(index, time.monotonic_ns(), 0)
+        shown: DisplayedPattern = self._handle.returned(DisplayedPattern(index, time.monotonic_ns(), 0))
+        return shown
 
     def play(self, exposure_s: float, period_s: float) -> None:
         self._handle.require_open()
-        if not self.info.plays or self._sequence is None:
+        if not self._info.plays or self._sequence is None:
             raise UnsupportedByDeviceError("this projector does not play, or has nothing to")
         WALL.play = (self._sequence, time.monotonic_ns(), exposure_s, period_s)
         self._light(self._sequence.profiles[0], "play")
@@ -316,6 +368,41 @@ class FaultyProjector:
         WALL.profile = profile
         lit = profile is not None and bool(profile.any())
         self._handle.line.say(device=PLAYER, light=lit, command=command)
+
+
+class FaultyTable(TurntableBase):
+    """Implements `slrig.devices.Turntable`."""
+
+    def __init__(self, options: Options) -> None:
+        super().__init__(4)
+        self._handle = Handle(TABLE, Line(options.desk))
+
+    @property
+    def axis(self) -> RotationAxis | None:
+        return None
+
+    @property
+    def angles_deg(self) -> Sequence[float]:
+        angles: Sequence[float] = self._handle.declared(super().angles_deg, "angles")
+        return angles
+
+    @property
+    def poses(self) -> Sequence[str]:
+        poses: Sequence[str] = self._handle.declared(super().poses, "poses")
+        return poses
+
+    @property
+    def opened_at_deg(self) -> float | None:
+        angle: float | None = self._handle.declared(None, "angle")
+        return angle
+
+    def turn(self, angle_deg: float) -> None:
+        del angle_deg
+        self._handle.require_open()
+        self._handle.step("turn")
+
+    def close(self) -> None:
+        self._handle.close()
 
 
 class DiskHook:
@@ -355,7 +442,22 @@ _HOOKED: set[str] = set()
 
 def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camera:
     del folder
-    return FaultyCamera(name, Options.model_validate(dict(options)))
+    camera = FaultyCamera(name, Options.model_validate(dict(options)))
+    return _opened(camera, camera._handle)
+
+
+def open_positioner(options: Mapping[str, object], folder: Path) -> Positioner:
+    del folder
+    table = FaultyTable(Options.model_validate(dict(options)))
+    return _opened(table, table._handle)
+
+
+def _opened(device: _Device, handle: Handle) -> _Device:
+    """What a factory returns. It does not hold what it opened if it returns something else."""
+    returned: _Device = handle.returned(device)
+    if returned is not device:
+        _OPEN.discard(handle.name)
+    return returned
 
 
 def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
@@ -365,4 +467,5 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     if table.desk not in _HOOKED:
         _HOOKED.add(table.desk)
         sys.addaudithook(DiskHook(table.desk))
-    return FaultyProjector(table)
+    projector = FaultyProjector(table)
+    return _opened(projector, projector._handle)

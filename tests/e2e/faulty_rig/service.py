@@ -192,12 +192,17 @@ calibration = "calibration.json"
 driver = "faulty"
 desk = "{desk}"
 plays = {plays}
+call_s = {call_s}
 [[camera]]
 name = "{camera}"
 driver = "faulty"
 desk = "{desk}"
 trigger = "{trigger}"
 exposure_s = 0.002
+call_s = {call_s}
+[positioner]
+driver = "faulty"
+desk = "{desk}"
 """
 _METADATA = "Metadata-Version: 2.1\nName: faulty-rig\nVersion: 1.0\n"
 _ENTRIES = f"""
@@ -205,15 +210,24 @@ _ENTRIES = f"""
 faulty = {__package__}.driver:open_camera
 [slrig.projectors]
 faulty = {__package__}.driver:open_projector
+[slrig.positioners]
+faulty = {__package__}.driver:open_positioner
 """
 
 
 def serve(
-    folder: Path, desk: Desk, trigger: str = "software", *, shutdown_s: float = SHUTDOWN_S, **settings: Any
+    folder: Path,
+    desk: Desk,
+    trigger: str = "software",
+    *,
+    shutdown_s: float = SHUTDOWN_S,
+    call_s: float = 0.0,
+    **settings: Any,
 ) -> ServiceProcess:
     """Start the service on a faulty rig with its driver installed; again on the same data in the same folder.
 
     With a hardware trigger its projector plays. shutdown_s : how long the service waits for a driver at its end.
+    call_s : see `slrig.devices.CallLimits`; 0 for the usual limits.
     """
     info = folder / "site" / "faulty_rig-1.0.dist-info"
     info.mkdir(parents=True, exist_ok=True)
@@ -222,7 +236,7 @@ def serve(
     write_calibration(folder / "calibration.json", calibration())
     rig = folder / "rig.toml"
     plays = "true" if trigger == "hardware" else "false"
-    rig.write_text(_RIG.format(desk=desk.path, plays=plays, trigger=trigger, camera=CAMERA_NAME))
+    rig.write_text(_RIG.format(desk=desk.path, plays=plays, trigger=trigger, camera=CAMERA_NAME, call_s=call_s))
     path = [str(info.parent), str(CHECKOUT), *filter(None, [os.environ.get("PYTHONPATH")])]
     driver: dict[str, Any] = {
         "PYTHONPATH": os.pathsep.join(path),

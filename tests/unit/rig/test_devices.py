@@ -9,12 +9,14 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
+from slrig import failure
 from slrig.devices import (
     AppliedSettings,
     CallLimits,
@@ -39,6 +41,7 @@ from slrig.errors import (
     StorageError,
     UnsupportedByDeviceError,
 )
+from slrig.failure import LastingThread
 from slrig.model import Frame, RotationAxis
 from slrig.rig.preview import Light, Picture, Previews, Watch
 from slrig.rig.session import FROM_THE_START, CountedTurntable, RigSession
@@ -207,6 +210,25 @@ def test_watchdog_barks_once_for_each_call_that_hangs() -> None:
     assert barked == ["projector 'p' show", "projector 'p' blank"]
 
 
+def test_a_loop_that_an_error_ends_is_begun_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(failure, "_BEGIN_ANEW_S", 0.0)
+    begun: list[int] = []
+
+    def loop() -> None:
+        begun.append(1)
+        if len(begun) < 4:
+            raise (SystemExit(3), GeneratorExit(), ValueError("\udcff"))[len(begun) - 1]
+
+    thread = LastingThread(loop, "slrig-test")
+    with capture_logs() as logs:
+        thread.start()
+        thread.join(WAIT_S)
+    assert (thread.is_alive(), thread.daemon, len(begun)) == (False, True, 4)
+    assert [(line["event"], line["thread"]) for line in logs] == [
+        ("a loop ended by an error, and is begun anew", "slrig-test")
+    ] * 3
+
+
 def test_every_call_of_a_device_is_guarded(monkeypatch: pytest.MonkeyPatch) -> None:
     camera, projector, calls = TameCamera(), TameProjector(), Calls()
     made: list[str] = []
@@ -252,6 +274,13 @@ class WordlessError(Exception):
         raise SystemExit(3)
 
 
+class WordlessDeviceError(DeviceError):
+    """One of slrig's tree, of a driver's own class."""
+
+    def __str__(self) -> str:
+        raise SystemExit(3)
+
+
 @pytest.mark.parametrize(
     ("raised", "words"),
     [
@@ -261,12 +290,15 @@ class WordlessError(Exception):
         (RuntimeError("/dev/cam\udcff\x1b[2J"), "RuntimeError: /dev/cam\\udcff\\u001b[2J)"),
         (WordlessError(), "WordlessError: WordlessError)"),
         (ValueError("x" * 10**6), " …)"),
+        (OSError(["no number"], "odd\udcff"), "odd\\udcff; check"),
+        (WordlessDeviceError(WordlessError()), "WordlessDeviceError"),
+        (DeviceError("/dev/cam\udcff"), "/dev/cam\\udcff (camera 'cam0', in read)"),
     ],
     ids=lambda each: type(each).__name__,
 )
-def test_whatever_a_driver_raises_is_a_defect_of_the_driver_in_words(raised: BaseException, words: str) -> None:
+def test_whatever_a_driver_raises_is_an_error_of_the_device_in_words(raised: BaseException, words: str) -> None:
     calls = Calls()
-    with capture_logs(), pytest.raises(DriverBrokenError) as told:
+    with capture_logs(), pytest.raises(DeviceError) as told:
         calls.make("camera 'cam0'", "read", 1.0, failing(raised))
     text = str(told.value)
     assert words in text
@@ -283,15 +315,33 @@ def test_whatever_a_driver_raises_is_a_defect_of_the_driver_in_words(raised: Bas
         ("read", {"t_err_ns": -5}, "± -5"),
         ("read", {"dropped_count": 2**40}, f"{2**40} lost before"),
         ("read", {"t_end_ns": math.inf}, "to inf ns"),
+        ("read", {"t_start_ns": 0, "t_end_ns": 10**30}, "from 0 to 1000000000000000000000000000000 ns"),
+        ("read", {"t_end_ns": 2**61}, "times of another clock"),
+        ("read", {"camera": "cam1"}, "camera 'cam0' returned a frame of camera 'cam1'"),
+        ("read", {"exposure_s": math.nan}, "an exposure of nan"),
+        ("read", {"gain": "high"}, "a gain of 'high'"),
+        ("read", {"image": np.zeros((2, 2), np.uint64)}, "(2, 2) uint64"),
+        ("read", {"image": np.zeros((0, 2), np.uint8)}, "(0, 2) uint8"),
+        ("read", {"colour": 5}, "colour cannot be asked for"),
         ("configure", 3, "returned 3, a AppliedSettings is expected"),
+        ("configure", AppliedSettings(math.inf, 1.0), "an exposure of inf"),
+        ("configure", AppliedSettings(0.01, math.nan), "a gain of nan"),
         ("info", None, "returned None, a CameraInfo is expected"),
+        ("info", {"exposure_range_s": (2.0, 1.0)}, "an exposure of 1.0"),
+        ("info", {"triggers": frozenset()}, "without any trigger"),
+        ("info", {"limits": CallLimits(math.nan)}, "a time limit of nan"),
+        ("info", {"serial": 5}, "returned 5, a str is expected"),
         ("show", DisplayedPattern(7, 0, 0), "asked for pattern 3"),
+        ("show", DisplayedPattern(3, 2**61, 0), "times of another clock"),
+        ("show", DisplayedPattern(3, 0, 2**61), "times of another clock"),
     ],
+    ids=str,
 )
 def test_values_that_no_device_has_are_a_defect_of_the_driver(step: str, returned: Any, words: str) -> None:
     camera, projector = TameCamera(), TameProjector()
     frame = Frame("cam0", np.zeros((2, 2), np.uint8), 0, 1, 0, 1, 0, 0.01, 1.0)
-    value = replace(frame, **returned) if isinstance(returned, dict) else returned
+    right: Any = camera.info if step == "info" else frame
+    value = replace(right, **returned) if isinstance(returned, dict) else returned
     device = projector if step == "show" else camera
     setattr(device, step, value if step == "info" else lambda *_: value)
 
@@ -307,6 +357,31 @@ def test_values_that_no_device_has_are_a_defect_of_the_driver(step: str, returne
 
     with capture_logs(), pytest.raises(DriverBrokenError, match=re.escape(words)):
         used()
+
+
+def test_colour_of_a_frame_is_asked_for_by_way_of_the_calls() -> None:
+    camera = TameCamera()
+    answers: list[object] = [np.zeros((2, 2, 3), np.uint8), None]
+    image = np.zeros((2, 2), np.uint8)
+    frame = Frame("cam0", image, 0, 1, 0, 1, 0, 0.01, 1.0, colour=lambda: answers.pop(0))  # type: ignore[arg-type, return-value]
+    camera.read = lambda *_: frame  # type: ignore[method-assign]
+    colour = (
+        guarded(Rig("bench", {"cam0": camera}, TameProjector(), {}), Calls(), {}).cameras["cam0"].read(0, 1.0).colour
+    )
+    assert colour is not None
+    assert colour().shape == (2, 2, 3)
+    with capture_logs(), pytest.raises(DriverBrokenError, match="camera 'cam0': its driver failed in read"):
+        colour()
+
+
+def test_what_a_turntable_declares_goes_by_way_of_the_calls() -> None:
+    whole = {"poses": ["0°"], "angles_deg": [0.0], "axis": None, "opened_at_deg": None}
+    calls = dict.fromkeys(("move", "turn", "close"), lambda *_: None)
+    for name, value in (("poses", [5]), ("angles_deg", [math.nan]), ("axis", 5), ("opened_at_deg", math.inf)):
+        declared: Any = SimpleNamespace(**{**calls, **whole, name: value})
+        table = guarded(Rig("bench", {}, TameProjector(), {}, positioner=declared), Calls(), {}).positioner
+        with capture_logs(), pytest.raises(DriverBrokenError, match=f"the positioner: its driver failed in {name}"):
+            getattr(table, name)
 
 
 def test_settings_are_kept_as_applied_with_what_was_refused_or_bent() -> None:
