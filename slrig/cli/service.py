@@ -41,22 +41,21 @@ def pool(
 ) -> None:
     """Be the scheduler of a pool: machines that reconstruct for many rigs.
 
-    With certificates, over TLS; without, for 127.0.0.1 alone.
+    Without certificates it makes some, for workers and services of the same user on this machine.
     """
     if ctx.invoked_subcommand is not None:
         return
-    from slrig.compute.security import pool_security, require_pool_extra
+    from slrig.compute.security import PoolAddress, pool_address, require_pool_extra
     from slrig.config import read_settings
     from slrig.logs import set_up_logs
 
     chosen = read_settings(settings, **given(compute_certificates=certificates))
     require_pool_extra()
-    from slrig.compute.host import serve_scheduler
+    from slrig.compute.scheduler import serve_scheduler
 
     set_up_logs(chosen.log_level, chosen.log_format)
-    scheme = "tcp" if chosen.compute_certificates is None else "tls"
-    address = f"{scheme}://{host}:{port}"
-    serve_scheduler(address, pool_security(address, chosen.compute_certificates), say=typer.echo)
+    place = pool_address(str(PoolAddress(host, port)), chosen.compute_certificates)
+    serve_scheduler(place, say=typer.echo)
 
 
 @pool_app.command()
@@ -89,7 +88,7 @@ def worker(
     settings: Settings = None,
 ) -> None:
     """Reconstruct for the rigs of a pool, one scan at a time."""
-    from slrig.compute.security import pool_security, require_pool_extra
+    from slrig.compute.security import pool_address, require_pool_extra
     from slrig.config import read_settings
     from slrig.errors import ConfigError
     from slrig.logs import set_up_logs
@@ -103,9 +102,9 @@ def worker(
     from slrig.compute.host import open_store, serve_worker
 
     set_up_logs(chosen.log_level, chosen.log_format)
-    security = pool_security(chosen.compute, chosen.compute_certificates)
+    address = pool_address(chosen.compute, chosen.compute_certificates)
     place = open_store(chosen.compute_store, chosen.compute_login_file)
-    serve_worker(chosen.compute, security, place, cache=chosen.data_dir / "cache", say=typer.echo)
+    serve_worker(address, place, cache=chosen.data_dir / "cache", say=typer.echo)
 
 
 def serve(
@@ -285,9 +284,9 @@ def restore(
 
     Every byte is checked first; nothing is overwritten.
     """
-    from slrig.jobs.backup import restore as restore_backup
+    from slrig.jobs.backup import restore as replacebackup
 
-    _tell(restore_backup(source, data), f"{data} made from {source}", as_json=as_json)
+    _tell(replacebackup(source, data), f"{data} made from {source}", as_json=as_json)
 
 
 def _tell(manifest: Manifest, what: str, *, as_json: bool) -> None:

@@ -1,1 +1,1 @@
-"""Reconstruction by a pool of machines: dask.distributed for the work, an S3 store for bundles and results."""
+"""Reconstruction by a pool of machines: orders over TLS, an S3 store for bundles and results."""

@@ -4,40 +4,53 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-import json
-import logging
 import os
-import platform
-import signal
+import shutil
 import tarfile
 import tempfile
+import threading
 import time
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Annotated, Any, Literal
 from urllib.parse import urlsplit
+from uuid import UUID
 
-import dask
 import obstore
 import structlog
-from distributed import Scheduler, Security, WorkerPlugin, get_worker
-from distributed import Worker as DaskWorker
-from distributed.diskutils import WorkSpace
+from filelock import FileLock, Timeout
 from obstore.exceptions import BaseError
 from obstore.store import LocalStore, S3Store
+from pydantic import Field
 
+from slrig.capture import EvidenceSummary
+from slrig.compute.link import (
+    POOL_FAULT,
+    Hello,
+    Message,
+    PoolError,
+    PoolRequest,
+    PoolResponse,
+    Progress,
+    Withdrawal,
+    cause,
+    connect,
+    run_until_told,
+)
+from slrig.compute.security import PoolAddress, require_private
 from slrig.config import is_loopback, read_private_text
 from slrig.disk import storage_errors
-from slrig.errors import ConfigError, ScanCancelledError, ServiceError, WorkerLostError
+from slrig.errors import ConfigError, ScanCancelledError, WorkerLostError
 from slrig.failure import JobFailure, job_failure
-from slrig.jobs.data_folder import BUNDLE, RESULT
 from slrig.jobs.database import versions
-from slrig.jobs.worker import POLL_S, READY, Compute, Task, Worker, prepare_kernel_cache
-from slrig.scan.job import PIPELINE
+from slrig.jobs.job import JobRun
+from slrig.jobs.worker import POLL_S, READY, Compute, Task, Worker, job_task, prepare_kernel_cache
+from slrig.scan.job import PIPELINE, ScanJob
+from slrig.scan.plan import ScanPlan
 
 if TYPE_CHECKING:
     from obstore.store import ClientConfig, ObjectStore, RetryConfig
@@ -55,16 +68,6 @@ _RETRIES: RetryConfig = {"max_retries": 2, "retry_timeout": timedelta(seconds=15
 
 Check = Callable[[], None]
 """Is called before each chunk, and raises what is to end the transfer. It must not use the store: that one is busy."""
-
-
-class PoolError(Exception):
-    """The pool or its store did not do its part; its text says why. The rig computes by itself.
-    final : whether another try would end in the same way.
-    """
-
-    def __init__(self, message: str, *, final: bool = False) -> None:
-        super().__init__(message)
-        self.final = final
 
 
 class PoolStore:
@@ -134,16 +137,6 @@ class PoolStore:
                 part.unlink(missing_ok=True)
             yield name
 
-    def stop(self, job: str) -> None:
-        """Have the machine that computes a job stop. Raises PoolError."""
-        with self._faults():
-            obstore.put(self._objects, _stop(job), b"stop")
-
-    def stopped(self, job: str) -> bool:
-        """Whether a job is to stop. Raises PoolError."""
-        with self._faults():
-            return self._has(_stop(job))
-
     def clear(self, *, bundle: str | None = None, job: str | None = None) -> None:
         """Remove a bundle, or what a job left. Raises PoolError."""
         with self._faults():
@@ -151,8 +144,8 @@ class PoolStore:
                 self._delete(_bundle(bundle))
             if job is not None:
                 listed = obstore.list(self._objects, prefix=f"results/{job}").collect()
-                for path in (*(each["path"] for each in listed), _stop(job)):
-                    self._delete(path)
+                for each in listed:
+                    self._delete(each["path"])
 
     def _put(self, path: str, file: IO[bytes], check: Check) -> None:
         chunks = _chunks(file, check)
@@ -260,10 +253,6 @@ def _result(job: str, name: str) -> str:
     return f"results/{job}/{name}"
 
 
-def _stop(job: str) -> str:
-    return f"stops/{job}"
-
-
 def _add(archive: tarfile.TarFile, path: Path, name: str) -> None:
     """Add a file such that the same bytes give the same archive, whoever wrote them and when."""
     entry = tarfile.TarInfo(name)
@@ -279,105 +268,65 @@ def _chunks(file: IO[bytes], check: Check) -> Iterator[bytes]:
         check()
 
 
-BEAT_S = 2.0
-"""How often a machine says that it works at a job, and looks whether it is to stop."""
-
 TELL_S = 0.2
 """How often a stage's progress is told at most: each time passes through this machine, the scheduler and the rig."""
-
-POOL_FAULT = "pool"
-"""The code of a fault that is not the task's own: another try may go well."""
-
-Tell = Callable[[Mapping[str, Any]], None]
 
 _VERSIONS = Task(versions, what="statement of versions")
 
 _log = structlog.get_logger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class PoolRequest:
-    """A task for a pool. bundle : its key in the store. task : its files are the rig's, see `Task.movable`.
-    topic : of dask's events, where its progress is told. versions : of the rig; others must not compute it.
-    """
+class PoolTask(Message):
+    """What a machine does for rigs, and all that it does: the second part of a scan. bundle : its key in the store."""
 
-    job: str
-    bundle: str
-    task: Task
-    topic: str
-    versions: Mapping[str, str]
+    name: Literal["scan"] = "scan"
+    id: UUID
+    bundle: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    plan: ScanPlan
+    evidence: EvidenceSummary | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class PoolResponse:
-    """What came of an order: the task's result, and the hash of each file in the store by its name; or a fault."""
-
-    result: Any = None
-    files: Mapping[str, str] = field(default_factory=dict)
-    fault: JobFailure | None = None
-
-
-def resource(found: Mapping[str, str]) -> str:
-    """The name that dask knows machines of these versions by: only they are given what asks for it."""
-    return f"slrig-{hashlib.sha256(json.dumps(dict(found), sort_keys=True).encode()).hexdigest()[:16]}"
-
-
-class Host(WorkerPlugin):
+class Host:
     """Does orders with `worker`. clock : seconds that only grow."""
 
-    name = "slrig"
-
     def __init__(self, store: PoolStore, worker: Compute, *, clock: Callable[[], float] = time.monotonic) -> None:
-        self._left = False
         self._store = store
         self._worker = worker
         self._clock = clock
 
-    def teardown(self, worker: DaskWorker) -> None:  # noqa: ARG002 - dask's own signature
-        """Drop what is computed: the pool is left, and dask gives it to another one. See `WorkerPlugin`."""
-        self._left = True
-
-    def done(self, order: PoolRequest, tell: Tell) -> PoolResponse:
-        """Do an order. tell : takes progress, and signs of life. Whatever goes wrong is in the answer."""
-        beaten_s, looked_s, stop = self._clock(), self._clock(), False
-
-        def beat() -> None:
-            nonlocal beaten_s
-            if self._clock() - beaten_s >= BEAT_S:
-                beaten_s = self._clock()
-                tell({"job": order.job})
-
-        def stopped() -> bool:
-            nonlocal looked_s, stop
-            beat()
-            if not stop and self._clock() - looked_s >= BEAT_S:
-                looked_s = self._clock()
-                try:
-                    stop = self._store.stopped(order.job)
-                except PoolError as error:
-                    _log.warning("whether a job is to stop could not be found out", cause=str(error))
-            return stop or self._left
-
-        tell({"job": order.job})
-        _log.info("computes for a rig", job=order.job, what=order.task.what)
+    def done(self, order: PoolRequest, tell: Callable[[Progress], None], stop: threading.Event) -> PoolResponse:
+        """Do an order, until `stop` is set. tell : takes progress. Whatever goes wrong is in the answer."""
         try:
-            return self._computed(order, tell, beat, stopped)
+            return self._computed(order, tell, stop)
         except (PoolError, WorkerLostError) as error:
             # A process that is lost, as where memory runs out, is the machine's fault rather than the task's.
-            return PoolResponse(fault=JobFailure(POOL_FAULT, str(error)))
+            fault = JobFailure(POOL_FAULT, str(error))
         except BaseException as error:  # noqa: BLE001 - a panic of obstore, too: the rig is told, and computes by itself
             if not isinstance(error, ScanCancelledError):
                 _log.warning("an order came to nothing", job=order.job, cause=repr(error))
-            return PoolResponse(fault=job_failure(error))
+            fault = job_failure(error)
+        with suppress(PoolError):  # the store removes it by and by
+            self._store.clear(job=order.job)
+        return PoolResponse(job=order.job, fault=fault)
 
-    def _computed(
-        self, order: PoolRequest, tell: Tell, beat: Callable[[], None], stopped: Callable[[], bool]
-    ) -> PoolResponse:
+    def _computed(self, order: PoolRequest, tell: Callable[[Progress], None], stop: threading.Event) -> PoolResponse:
+        try:
+            given = PoolTask.model_validate(order.task)
+        except ValueError as error:
+            message = "the order is no task of a pool, and is not done"
+            raise PoolError(message) from error
+        _log.info("computes for a rig", job=order.job, what=given.name)
+        tell(Progress(job=order.job))
         # Of the process that computes: after an update of the files beneath, it is newer than this one.
-        mine = self._worker.run(_VERSIONS, cancelled=stopped)
-        if mine != order.versions:
+        if self._worker.run(_VERSIONS, cancelled=stop.is_set) != order.versions:
             message = "the machine's versions of slrig and its libraries have changed; start slrig worker again"
             raise PoolError(message)
+
+        def check() -> None:
+            if stop.is_set():
+                message = "It was cancelled."
+                raise ScanCancelledError(message)
+
         with tempfile.TemporaryDirectory(prefix="slrig-pool-") as scratch:
             last, told_s = "", 0.0
 
@@ -387,127 +336,100 @@ class Host(WorkerPlugin):
                     return
                 last, told_s = stage, self._clock()
                 told = detail.replace(f"{scratch}/", "")
-                tell({"job": order.job, "stage": stage, "fraction": fraction, "detail": told})
+                tell(Progress(job=order.job, stage=stage, fraction=fraction, detail=told))
 
-            bundle, result = Path(scratch) / BUNDLE, Path(scratch) / RESULT
-            self._store.fetch_bundle(order.bundle, bundle, beat)
-            files = None if order.task.files is None else replace(order.task.files, folder=Path(scratch), place=None)
-            task = replace(order.task, files=files, where={"where": "pool"}, remedy="Its rig computes by itself.")
+            run = JobRun(given.id, Path(scratch), None, progress, stop.is_set, evidence=given.evidence)
+            task = replace(
+                job_task(ScanJob(given.plan), run), where={"where": "pool"}, remedy="Its rig computes by itself."
+            )
+            self._store.fetch_bundle(given.bundle, run.bundle, check)
             # While the next file is made, the last one travels.
             line, sent = ThreadPoolExecutor(1, thread_name_prefix="slrig-store"), dict[str, Future[str]]()
 
             def made(name: str) -> None:
-                sent[name] = line.submit(self._store.put_result, order.job, result / name, beat)
+                sent[name] = line.submit(self._store.put_result, order.job, run.result / name, check)
 
             try:
-                answer = self._worker.run(task, progress=progress, cancelled=stopped, made=made)
+                result = self._worker.run(task, progress=progress, cancelled=stop.is_set, made=made)
                 # A task that makes no file makes no folder.
-                for path in result.glob("*"):
+                for path in run.result.glob("*"):
                     if path.name not in sent:
                         made(path.name)
-                return PoolResponse(answer, {name: sent[name].result() for name in sorted(sent)})
+                files = {name: sent[name].result() for name in sorted(sent)}
+                answer = PoolResponse(job=order.job, result=result, files=files)
+                answer.model_dump_json()  # raises here, rather than where nobody would tell the rig
+                return answer
             finally:
                 line.shutdown(cancel_futures=True)
-
-
-def compute(order: PoolRequest) -> PoolResponse:
-    """Do an order on the machine that dask chose: what a rig submits."""
-    worker = get_worker()
-    host: Any = worker.plugins[Host.name]
-    answer: PoolResponse = host.done(order, lambda told: worker.log_event(order.topic, dict(told)))
-    return answer
 
 
 RETURN_S = 2.0
 """How often a worker looks for its scheduler."""
 
-LOST_WORKER_S = 30
-"""From when on a worker that was not heard of is given up by the scheduler; each is heard of once a second."""
 
-KEPT_EVENTS = 50
-"""How many events of each topic the scheduler keeps, which nobody asks for. Each start of a rig's service is a topic,
-and never forgotten: of dask's 1 000 it would keep 0.3 MB."""
+async def join(address: PoolAddress, host: Host, *, say: Callable[[str], None]) -> None:
+    """Be a worker of a pool until the connection ends. Raises OSError, PoolError, ConfigError."""
+    loop, link = asyncio.get_running_loop(), await connect(address, Hello(versions=dict(versions())))
+    say(f"computes for the pool {address}. Ctrl-C stops it.")
+    stop, doing, job = threading.Event(), set[asyncio.Task[None]](), ""
 
-_PAGES = "127.0.0.1:0"
-"""Where dask's HTTP server listens, which cannot be left out and asks nobody for a certificate. It has no pages."""
+    def tell(progress: Progress) -> None:
+        loop.call_soon_threadsafe(link.send, progress)
 
-_SETTINGS: dict[str, Any] = {
-    "distributed.scheduler.http.routes": [],
-    "distributed.worker.http.routes": [],
-    # What dask learns about itself for pages that are not there: stacks 100 times a second, delays 50 times, memory
-    # twice. Each process took 4 % of a core while it had nothing to do.
-    "distributed.worker.profile.enabled": False,
-    "distributed.admin.tick.interval": "1s",
-    "distributed.admin.system-monitor.interval": "10s",
-    # Copies of results, of which there are none.
-    "distributed.scheduler.active-memory-manager.start": False,
-}
+    async def do(order: PoolRequest) -> None:
+        link.send(await asyncio.to_thread(host.done, order, tell, stop))
 
+    def heard(message: Message) -> None:
+        nonlocal stop, job
+        if isinstance(message, PoolRequest) and all(each.done() for each in doing):
+            stop, job = threading.Event(), message.job
+            doing.clear()
+            doing.add(asyncio.create_task(do(message)))
+        elif isinstance(message, Withdrawal) and message.job == job:
+            stop.set()
 
-def serve_scheduler(address: str, security: Security | None, *, say: Callable[[str], None]) -> None:
-    """Be the scheduler of a pool at `address` until SIGTERM or Ctrl-C. Raises ServiceError: it cannot listen there."""
-
-    async def life(stopped: asyncio.Event) -> None:
-        scheduler = Scheduler(host=address, security=security, dashboard=False, dashboard_address=_PAGES)
-        try:
-            await scheduler
-        except (OSError, RuntimeError) as error:
-            cause = error.__cause__ or error
-            message = f"The pool's scheduler cannot listen at {address}: {cause}. Choose another host or port."
-            raise ServiceError(message) from error
-        async with scheduler:
-            say(f"the pool's scheduler is at {scheduler.address}. Ctrl-C stops it.")
-            await stopped.wait()
-
-    dask.config.set({"distributed.scheduler.worker-ttl": LOST_WORKER_S, **_SETTINGS})
-    dask.config.set({"distributed.admin.low-level-log-length": KEPT_EVENTS})
-    _until_told(life)
+    try:
+        await link.hear(heard)
+    finally:
+        # Nobody waits for it: the scheduler gives it to another one.
+        link.close()
+        stop.set()
+        await asyncio.gather(*doing, return_exceptions=True)
 
 
-def serve_worker(
-    scheduler: str, security: Security | None, store: PoolStore, *, cache: Path, say: Callable[[str], None]
-) -> None:
+def serve_worker(address: PoolAddress, store: PoolStore, *, cache: Path, say: Callable[[str], None]) -> None:
     """Compute for a pool until SIGTERM or Ctrl-C. A scheduler that is not there, or is lost, is waited for.
     cache : for kernels, where slrig's own folder is read-only. Raises WorkerLostError: kernels cannot be loaded.
     """
-    dask.config.set(_SETTINGS)
     prepare_kernel_cache(cache)
-    # dask's own choice is every interface, also where there are no certificates.
-    host = "127.0.0.1" if is_loopback(urlsplit(scheduler).hostname or "") else None
-    beneath, name = Worker(PIPELINE), f"{platform.node()}-{os.getpid()}"
+    beneath = Worker(PIPELINE)
 
-    async def life(stopped: asyncio.Event) -> None:
+    async def life() -> None:
         told = ""
+
+        def tell(found: str) -> None:
+            nonlocal told
+            if found != told:
+                say(told := found)
+
         # A rig would wait for kernels to be compiled.
-        while beneath.condition != READY and not stopped.is_set():
+        while beneath.condition != READY:
             if not beneath.loading:
                 raise WorkerLostError(beneath.condition)
             await asyncio.sleep(POLL_S)
-        while not stopped.is_set():
+        while True:
             try:
                 # A job at a time: the process beneath has one, and machines with more cores run more workers.
-                async with DaskWorker(
-                    scheduler, name=name, security=security, nthreads=1, memory_limit=0, host=host,
-                    local_directory=tempfile.gettempdir(), resources={resource(versions()): 1},
-                    plugins=(Host(store, beneath),), death_timeout=CONNECT_S,
-                    dashboard=False, dashboard_address=_PAGES,
-                ) as member:  # fmt: skip
-                    say(told := f"computes for the pool {scheduler}. Ctrl-C stops it.")
-                    ends = [asyncio.create_task(stopped.wait()), asyncio.create_task(member.finished())]
-                    await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
-                    for each in ends:
-                        each.cancel()
-            except (OSError, RuntimeError) as error:
-                found = f"the scheduler {scheduler} does not answer ({type(error.__cause__ or error).__name__})"
-                if told != found:
-                    say(told := found)
-            with suppress(TimeoutError):
-                await asyncio.wait_for(stopped.wait(), RETURN_S)
+                await join(address, Host(store, beneath), say=tell)
+                tell(f"the scheduler {address} is gone")
+            except (OSError, PoolError, ConfigError) as error:
+                tell(f"the scheduler {address} does not answer: {cause(error)}")
+            await asyncio.sleep(RETURN_S)
 
     try:
         with _scratch():
             beneath.start()
-            _until_told(life)
+            run_until_told(life)
     finally:
         beneath.close()
 
@@ -517,42 +439,18 @@ def _scratch() -> Iterator[None]:
     """Have what this process and those beneath it put into TMPDIR lie in a folder of its own there, and remove what a
     worker of the same user left that was killed.
     """
-    place = Path(tempfile.gettempdir(), f"slrig-workers-{os.getuid()}")
+    place = Path(tempfile.gettempdir(), f"slrig-workers-{os.geteuid()}")
     with storage_errors(place):
         place.mkdir(mode=0o700, exist_ok=True)
-        if place.lstat().st_uid != os.getuid():
-            message = f"{place} belongs to somebody else. Set TMPDIR to a folder of your own."
-            raise ConfigError(message)
-    # dask's own: it locks the folder as long as this process lives.
-    folder = WorkSpace(str(place)).new_work_dir(prefix="worker-")
-    os.environ["TMPDIR"] = tempfile.tempdir = folder.dir_path
-    try:
+    require_private(place)
+    with ExitStack() as stack:
+        with FileLock(place / "lock"):
+            for left in place.glob("worker-*"):
+                with suppress(Timeout), FileLock(left / "lock", timeout=0):
+                    shutil.rmtree(left, ignore_errors=True)
+            folder = tempfile.mkdtemp(prefix="worker-", dir=place)
+            stack.callback(shutil.rmtree, folder, ignore_errors=True)
+            # As long as this process lives.
+            stack.enter_context(FileLock(Path(folder, "lock")))
+        os.environ["TMPDIR"] = tempfile.tempdir = folder
         yield
-    finally:
-        folder.release()
-
-
-def _until_told(life: Callable[[asyncio.Event], Awaitable[None]]) -> None:
-    """Run until SIGTERM or Ctrl-C."""
-    join_logs()
-
-    async def live() -> None:
-        stopped = asyncio.Event()
-        for each in (signal.SIGTERM, signal.SIGINT):
-            asyncio.get_running_loop().add_signal_handler(each, stopped.set)
-        await life(stopped)
-
-    asyncio.run(live())
-
-
-CONNECT_S = 5.0
-"""The longest that the scheduler may take to answer: it does nothing else."""
-
-
-def join_logs() -> None:
-    """Have the lines of distributed, which brings handlers of its own along, go the way of all others."""
-    for name in [each for each in logging.root.manager.loggerDict if each.partition(".")[0] == "distributed"]:
-        logger = logging.getLogger(name)
-        logger.handlers.clear()
-        logger.propagate = True
-        logger.setLevel(logging.NOTSET)

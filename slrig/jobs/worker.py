@@ -55,8 +55,8 @@ class Task:
     """A task of the worker: a call of a function, which is found there by its name and loads its mathematics itself.
 
     files : of a job, whose `Job.compute` the function is: it is given a `JobRun`. what : the task in words. remedy :
-    what a person can do when the worker is lost in the middle of it. movable : the bundle among its files is all that
-    is needed: another machine may do it. where : how it came to be done where it is, for a report.
+    what a person can do when the worker is lost in the middle of it. where : how it came to be done where it is, for a
+    report.
     """
 
     function: Callable[..., Any]
@@ -64,7 +64,6 @@ class Task:
     files: JobFiles | None = None
     what: str = "task"
     remedy: str = "Try again."
-    movable: bool = False
     where: Mapping[str, str] = field(default_factory=lambda: {"where": "local"})
 
 
@@ -678,7 +677,7 @@ def _error(failed: Failed) -> Exception:
 def job_task(job: Job, run: JobRun) -> Task:
     """The second part of a job as a task."""
     files = JobFiles(run.id, run.folder, run.place, run.evidence)
-    return Task(job.compute, (), files, what=job.noun, remedy=job.remedy, movable=job.movable)
+    return Task(job.compute, (), files, what=job.noun, remedy=job.remedy)
 
 
 class Compute(Protocol):

@@ -30,7 +30,7 @@ from tests.unit.command import done
 from tests.unit.scan.fakes import reconstruction
 
 if TYPE_CHECKING:
-    from slrig.compute.pooled import DaskCluster, PooledWorker
+    from slrig.compute.pooled import PoolClient, PooledWorker
 
 SECRET = "the-secret-of-the-store"  # noqa: S105 - nothing but a test's
 BUCKET = "s3://scans/hall-3"
@@ -156,7 +156,8 @@ class Pool:
         self.store.make_bucket()
         for each in (self.scheduler, *self.workers):
             each.wait_until_it_works()
-            assert {at.rpartition(":")[0] for at in listening_at(each.process.pid)} == {"127.0.0.1"}
+        assert listening_at(self.scheduler.process.pid) == {f"127.0.0.1:{port}"}
+        assert not any(listening_at(each.process.pid) for each in self.workers)
 
     def service(self, *, wired: bool = False) -> dict[str, str]:
         """What the environment of a service says of the pool."""
@@ -168,17 +169,17 @@ class Pool:
             "SLRIG_COMPUTE_CERTIFICATES": str(self.certificates),
         }
 
-    def rig(self, local: Compute, *, wired: bool = False) -> tuple[PooledWorker, DaskCluster]:
+    def rig(self, local: Compute, *, wired: bool = False) -> tuple[PooledWorker, PoolClient]:
         """A service's worker, begun, and its connection; `service` is in the environment already."""
         from slrig.compute.host import open_store
-        from slrig.compute.pooled import DaskCluster, PooledWorker
-        from slrig.compute.security import pool_security
+        from slrig.compute.pooled import PoolClient, PooledWorker
+        from slrig.compute.security import pool_address
 
         address = self.service(wired=wired)["SLRIG_COMPUTE"]
-        cluster = DaskCluster(address, pool_security(address, self.certificates))
-        worker = PooledWorker(local, cluster, open_store(BUCKET))
+        client = PoolClient(pool_address(address, self.certificates))
+        worker = PooledWorker(local, client, open_store(BUCKET))
         worker.start()
-        return worker, cluster
+        return worker, client
 
 
 def _store(port: int) -> dict[str, str]:
@@ -188,7 +189,7 @@ def _store(port: int) -> dict[str, str]:
 
 @pytest.fixture
 def pool(tmp_path: Path) -> Iterator[Pool]:
-    if not all(map(find_spec, ("distributed", "flask_cors", "moto", "obstore"))):
+    if not all(map(find_spec, ("flask_cors", "moto", "obstore"))):
         lacking("needs a pool's libraries, and an S3 server: pip install -e '.[pool,s3]'")
     with ExitStack() as stack:
         yield Pool(tmp_path, stack)
@@ -203,7 +204,7 @@ class Rig:
 
     def __init__(self, pool: Pool, bundle: Path, local: Worker) -> None:
         self.bundle = bundle
-        self.worker, self.cluster = pool.rig(local, wired=True)
+        self.worker, self.client = pool.rig(local, wired=True)
 
     def computed(self, result: Path, *, when_begun: Callable[[], None]) -> dict[str, Any]:
         """Reconstruct, with something done in the middle; return the report's section."""
@@ -241,7 +242,7 @@ def test_whatever_is_lost_a_scan_has_its_one_result(
 
     local = Worker(PIPELINE)
     rig = Rig(pool, bundle, local)
-    assert rig.cluster.usable(30)
+    assert rig.client.usable(30)
     try:
         shutil.copytree(bundle, tmp_path / "alone" / "bundle")
         alone = tmp_path / "alone" / "result"
@@ -257,7 +258,7 @@ def test_whatever_is_lost_a_scan_has_its_one_result(
             return section
 
         def kill_who_computes() -> None:
-            (order,) = rig.cluster._told
+            (order,) = rig.client._orders
             (found,) = (each for each, log in zip(pool.workers, pool.logs[2:], strict=True) if order in log.read_text())
             found.process.send_signal(signal.SIGKILL)
 
@@ -265,15 +266,14 @@ def test_whatever_is_lost_a_scan_has_its_one_result(
         assert sorted(each.process.poll() is None for each in pool.workers) == [False, True]
 
         with monkeypatch.context() as impatient:
-            impatient.setattr("slrig.compute.pooled.SILENCE_LIMIT_S", 3.0)
-            impatient.setattr("slrig.compute.pooled.BEGIN_LIMIT_S", 3.0)
+            impatient.setattr("slrig.compute.link.LOST_S", 3.0)
             assert "because" in right("network", pool.wires[0].cut)
         pool.wires[0].mend()
-        assert rig.cluster.usable(30)
+        assert rig.client.usable(30)
 
         assert "lost" in right("scheduler", pool.scheduler.kill)["because"]
         pool.scheduler.start_again()
-        assert rig.cluster.usable(30)
+        assert rig.client.usable(30)
         assert right("again", lambda: None)["where"] == "pool"
 
         assert "store s3://scans/hall-3 failed" in right("store", pool.store.kill)["because"]

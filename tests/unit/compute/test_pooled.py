@@ -3,77 +3,54 @@
 from __future__ import annotations
 
 import asyncio
-import gc
 import hashlib
 import os
 import re
-import signal
-import socket
-import ssl
 import tempfile
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import replace
+from contextlib import suppress
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 pytest.importorskip("obstore", reason="needs a pool's libraries: pip install 'slrig[pool]'")
-pytest.importorskip("distributed", reason="needs a pool's libraries: pip install 'slrig[pool]'")
 pytest.importorskip("cryptography", reason="needs a pool's libraries: pip install 'slrig[pool]'")
 
 import obstore
-from distributed import Scheduler, Status
-from distributed.diskutils import DIR_LOCK_EXT
 from obstore.store import MemoryStore
 
-from slrig.compute.certificates import AUTHORITY_KEY, make_certificates
-from slrig.compute.host import (
-    BEAT_S,
-    CHUNK_BYTES,
-    KEPT_EVENTS,
+from slrig.compute.host import CHUNK_BYTES, TELL_S, Host, PoolStore, PoolTask, _scratch, join, open_store
+from slrig.compute.link import (
     POOL_FAULT,
-    TELL_S,
-    Host,
     PoolError,
     PoolRequest,
     PoolResponse,
-    PoolStore,
-    _scratch,
-    open_store,
-    resource,
-    serve_scheduler,
+    Progress,
+    Workers,
 )
-from slrig.compute.pooled import (
-    BEGIN_LIMIT_S,
-    SILENCE_LIMIT_S,
-    TRANSFER_LIMIT_S,
-    DaskCluster,
-    NewsCallback,
-    PooledWorker,
-)
-from slrig.compute.security import KEY, pool_security
+from slrig.compute.pooled import BEGIN_LIMIT_S, TRANSFER_LIMIT_S, NewsCallback, PoolClient, PooledWorker
+from slrig.compute.security import PoolAddress
 from slrig.errors import (
     ConfigError,
     NothingToReconstructError,
     ScanCancelledError,
     ScanInterruptedError,
-    ServiceError,
     StorageError,
     WorkerLostError,
 )
 from slrig.jobs.data_folder import RESULT
 from slrig.jobs.database import versions
-from slrig.jobs.job import FrameFeed, JobRun
+from slrig.jobs.job import FrameFeed, JobRun, Outcome
 from slrig.jobs.worker import READY, Task
 from slrig.model import Region
+from slrig.scan.plan import ScanPlan
 from tests.listening import listening_at
-from tests.unit.command import slrig
+from tests.unit.compute.test_scheduler import beside_a_scheduler
 from tests.unit.scan import fake_pipeline
-from tests.unit.scan.fakes import reconstruction
+from tests.unit.scan.fakes import never, reconstruction
 
 
 class TameWorker:
@@ -133,17 +110,17 @@ class TameOrder(Future[PoolResponse]):
         return answer
 
 
-class TameCluster:
-    """`Cluster`. acts : what becomes of the orders, one after another; without any, a machine does them."""
-
-    topic, fault = "rig", "the pool does not answer"
+class TameClient(PoolClient):
+    """acts : what becomes of the orders, one after another; without any, a machine does them, until `stop`."""
 
     def __init__(self, host: Host) -> None:
+        self.fault = "the pool does not answer"
         self.host = host
         self.there = True
         self.acts: list[Callable[[PoolRequest], PoolResponse | None]] = []
         self.orders: list[TameOrder] = []
-        self.told: list[Mapping[str, Any]] = []
+        self.told: list[Progress] = []
+        self.stop = threading.Event()
 
     def start(self) -> None:
         """Nothing to be done."""
@@ -155,9 +132,15 @@ class TameCluster:
         return self.there
 
     def submit(self, order: PoolRequest, told: NewsCallback) -> TameOrder:
-        act = self.acts.pop(0) if self.acts else lambda each: self.host.done(each, self.told.append)
+        # As it crosses connections.
+        order = PoolRequest.model_validate_json(order.model_dump_json())
+        act = self.acts.pop(0) if self.acts else self.done
         self.orders.append(TameOrder(act, order, told))
         return self.orders[-1]
+
+    def done(self, order: PoolRequest) -> PoolResponse:
+        answer = self.host.done(order, self.told.append, self.stop)
+        return PoolResponse.model_validate_json(answer.model_dump_json())
 
 
 class Pool:
@@ -168,8 +151,8 @@ class Pool:
         self.store = PoolStore("memory://", self.objects)
         self.now_s = 0.0
         self.local, self.remote = TameWorker(), TameWorker()
-        self.cluster = TameCluster(Host(self.store, self.remote, clock=lambda: self.now_s))
-        self.worker = PooledWorker(self.local, self.cluster, self.store, clock=lambda: self.now_s)
+        self.client = TameClient(Host(self.store, self.remote, clock=lambda: self.now_s))
+        self.worker = PooledWorker(self.local, self.client, self.store, clock=lambda: self.now_s)
 
     def passes(self, seconds: float) -> Callable[[PoolRequest], None]:
         """An act: time passes without an answer."""
@@ -198,144 +181,19 @@ def job(folder: Path, order: str = "finish") -> Task:
     return reconstruction(folder / "staged")
 
 
-ADDRESS = "tls://pool:8786"
-
-
-def context(folder: Path, part: str) -> ssl.SSLContext:
-    security: Any = pool_security(ADDRESS, folder)
-    found: ssl.SSLContext = getattr(security, f"get_{part}_args")(
-        *(["client"] if part == "connection" else ["scheduler"])
-    )["ssl_context"]
-    return found
-
-
-def greet(client: ssl.SSLContext, server: ssl.SSLContext) -> None:
-    """Let two shake hands, without a network. Raises ssl.SSLError: one of them refuses."""
-    there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
-    ends = [client.wrap_bio(back, there), server.wrap_bio(there, back, server_side=True)]
-    for _ in range(4):
-        for end in ends:
-            try:
-                end.do_handshake()
-            except ssl.SSLWantReadError:
-                continue
-    ends[0].write(b"hello")
-    assert ends[1].read() == b"hello"
-
-
-def test_members_of_one_pool_accept_one_another_and_no_others(tmp_path: Path) -> None:
-    ours, theirs = tmp_path / "ours", tmp_path / "theirs"
-    made = slrig("pool", "certificates", ours)
-    assert made.output.split() == [str(ours / name) for name in ("scheduler", "worker", "rig")]
-    assert make_certificates(ours, ("rig", "rig-7")) == [ours / "rig-7"]
-    make_certificates(theirs, ("rig",))
-    server = context(ours / "scheduler", "listen")
-    greet(context(ours / "rig", "connection"), server)
-    greet(context(ours / "rig-7", "connection"), server)
-    with pytest.raises(ssl.SSLError):
-        greet(context(theirs / "rig", "connection"), server)
-    with pytest.raises(ssl.SSLError):
-        greet(context(ours / "rig", "connection"), context(theirs / "rig", "listen"))
-    anonymous = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    anonymous.check_hostname, anonymous.verify_mode = False, ssl.CERT_NONE
-    with pytest.raises(ssl.SSLError):
-        greet(anonymous, server)
-    keys = [*ours.glob(f"*/{KEY}"), ours / AUTHORITY_KEY]
-    assert len(keys) == 5
-    assert {oct(path.stat().st_mode & 0o777) for path in keys} == {"0o600"}
-    assert {oct(path.parent.stat().st_mode & 0o777) for path in keys} == {"0o700"}
-
-
-def test_certificates_are_needed_beyond_this_machine_and_their_key_is_private(tmp_path: Path) -> None:
-    assert pool_security("tcp://127.0.0.1:8786", None) is None
-    with pytest.raises(ConfigError, match=r"lacks authority\.pem, certificate\.pem, key\.pem"):
-        pool_security(ADDRESS, tmp_path)
-    (place,) = make_certificates(tmp_path, ("worker",))
-    (place / KEY).chmod(0o644)
-    with pytest.raises(ConfigError, match="chmod 600"):
-        pool_security(ADDRESS, place)
-
-
-@pytest.mark.parametrize(
-    ("address", "why"),
-    [
-        ("tcp://pool:8786", "any code"),
-        ("tcp://0.0.0.0:8786", "any code"),
-        ("pool:8786", "no address"),
-        ("tls://pool", "no address"),
-        ("tls://pool:port", "no address"),
-        (ADDRESS, "found none"),
-    ],
-)
-def test_an_address_that_is_not_safe_is_refused(address: str, why: str) -> None:
-    with pytest.raises(ConfigError, match=why):
-        pool_security(address, None)
-
-
-def test_certificates_are_made_in_folders_that_can_be_for_names_of_machines(tmp_path: Path) -> None:
-    for name in ("../rig", "r" * 65):
-        with pytest.raises(ConfigError, match=r"no name for a machine.*64"):
-            make_certificates(tmp_path, (name,))
-    assert list(tmp_path.iterdir()) == []
-    (tmp_path / "file").touch()
-    for folder in (tmp_path / "file", tmp_path / "file" / "certificates"):
-        with pytest.raises(StorageError, match="choose another folder"):
-            make_certificates(folder, ("rig",))
-
-
-def test_a_service_with_a_pool_needs_a_store(tmp_path: Path) -> None:
-    for options in (["--compute", "tcp://127.0.0.1:1"], ["--store", "s3://scans"]):
-        rig = Path(__file__).parents[3] / "config" / "rigs" / "demo.toml"
-        told = slrig("serve", rig, "--data", tmp_path / "data", "--port", "0", *options)
-        assert (told.exit_code, "needs a store as well" in told.stderr) == (2, True), told.output
-    told = slrig("worker", "--scheduler", "tcp://127.0.0.1:1")
-    assert (told.exit_code, "--store" in told.stderr) == (2, True)
-
-
-def test_scheduler_listens_at_its_address_alone_and_keeps_few_events() -> None:
-    found: set[str] = set()
-    kept: set[int] = set()
-
-    def say(_words: str) -> None:
-        found.update(listening_at())
-        (scheduler,) = (each for each in Scheduler._instances if each.status is Status.running)
-        for number in range(2 * KEPT_EVENTS):
-            scheduler.log_event("a rig", number)
-        kept.add(len(scheduler.get_events("a rig")))
-        signal.raise_signal(signal.SIGTERM)
-
-    before = listening_at()
-    serve_scheduler("tcp://127.0.0.1:0", None, say=say)
-    assert kept == {KEPT_EVENTS}
-    assert len(found - before) == 2
-    assert {address.rpartition(":")[0] for address in found - before} == {"127.0.0.1"}
-
-
-# dask leaves what it could not bind to Python's collector.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
-def test_address_in_use_is_named() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as holder:
-        address = f"tcp://127.0.0.1:{holder.getsockname()[1]}"
-        with pytest.raises(ServiceError, match=f"cannot listen at {address}: .*in use"):
-            serve_scheduler(address, None, say=print)
-    gc.collect()
-
-
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     found = tmp_path / f"slrig-workers-{os.getuid()}"
-    found.mkdir()
+    found.mkdir(mode=0o700)
     return found
 
 
 def test_what_a_killed_worker_left_is_removed_by_the_next_one(
     place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # dask's file is locked as long as the worker lives.
     (place / "worker-killed" / "bundle").mkdir(parents=True)
-    (place / f"worker-killed{DIR_LOCK_EXT}").touch()
     with _scratch():
         bundle = Path(tempfile.mkdtemp(), "bundle")
         bundle.mkdir()
@@ -343,13 +201,7 @@ def test_what_a_killed_worker_left_is_removed_by_the_next_one(
         monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
         with _scratch():
             assert bundle.is_dir()
-    assert {path.name for path in place.iterdir()} == {"global.lock", "purge.lock"}
-
-
-def test_workers_use_no_folder_of_another_user(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Path, "lstat", lambda _: os.stat_result((0o40777, 0, 0, 1, os.getuid() + 1, *[0] * 5)))
-    with pytest.raises(ConfigError, match=f"{place.name} belongs to somebody else"), _scratch():
-        pass
+    assert [each.name for each in place.iterdir()] == ["lock"]
 
 
 FILES = {"mesh.ply", "mesh.glb", "points.ply", "preview.png", "report.json"}
@@ -374,53 +226,75 @@ def test_the_pool_gives_what_this_machine_gives(pool: Pool, tmp_path: Path) -> N
     assert set(made) == files(tmp_path / "pooled").keys() == FILES
     assert found.summary["seconds"] == 1.5
     assert pool.remote.done[-1].where == {"where": "pool"}
-    assert [told["stage"] for told in pool.cluster.told if "stage" in told] == ["decode", "done"]
-    assert pool.cluster.orders[0].cancelled()
+    assert [told.stage for told in pool.client.told] == ["", "decode", "done"]
+    assert pool.client.orders[0].cancelled()
     assert pool.tidied() == set()
 
 
+def test_members_of_one_user_find_one_another_and_listen_nowhere_else(pool: Pool, tmp_path: Path) -> None:
+    def act(address: PoolAddress) -> None:
+        assert {each.rpartition(":")[0] for each in listening_at() - before} == {"127.0.0.1"}
+        client, said = PoolClient(address), list[str]()
+        rig, joined = PooledWorker(pool.local, client, pool.store), Future[None]()
+
+        async def joins() -> None:
+            member = asyncio.ensure_future(join(address, pool.client.host, say=said.append))
+            joined.add_done_callback(lambda _: member.get_loop().call_soon_threadsafe(member.cancel))
+            with suppress(asyncio.CancelledError):
+                await member
+
+        machine = threading.Thread(target=asyncio.run, args=(joins(),))
+        rig.start()
+        machine.start()
+        try:
+            assert client.usable(30), client.fault
+            task, stages = job(tmp_path), list[str]()
+            assert rig.run(task, progress=lambda stage, *_: stages.append(stage)).summary["seconds"] == 1.5
+            assert files(tmp_path).keys() == FILES
+            assert (stages, pool.local.done) == (["waiting for the pool", "decode", "done"], [])
+            assert said == [f"computes for the pool {address}. Ctrl-C stops it."]
+        finally:
+            joined.set_result(None)
+            machine.join(30)
+            rig.close()
+
+    before = listening_at()
+    beside_a_scheduler(act)
+    with pytest.raises(ConfigError, match="no slrig pool of this user has listened at port 1 "):
+        PoolAddress("127.0.0.1", 1).tls(listens=False)
+
+
 def gone(pool: Pool) -> None:
-    pool.cluster.there = False
+    pool.client.there = False
 
 
 def never_begins(pool: Pool) -> None:
-    pool.cluster.acts = [pool.passes(BEGIN_LIMIT_S + 1)]
-
-
-def falls_silent(pool: Pool) -> None:
-    def tells_once(order: PoolRequest) -> None:
-        begun = pool.now_s > 0
-        pool.now_s += SILENCE_LIMIT_S + 1 if begun else 1
-        if not begun:
-            pool.cluster.orders[-1].told({"job": order.job})
-
-    pool.cluster.acts = [tells_once]
-    pool.cluster.usable = lambda timeout_s=0.0: timeout_s == 0.0  # type: ignore[method-assign]
+    pool.client.acts = [pool.passes(BEGIN_LIMIT_S + 1)]
 
 
 def is_lost_twice(pool: Pool) -> None:
-    pool.cluster.acts = [lost, lost]
+    pool.client.acts = [lost, lost]
 
 
 def is_lost_for_good(pool: Pool) -> None:
     def act(_order: PoolRequest) -> PoolResponse:
-        pool.cluster.there = False
+        pool.client.there = False
         raise PoolError("the pool lost the job")
 
-    pool.cluster.acts = [act]
+    pool.client.acts = [act]
 
 
 def answers_wrong_bytes(pool: Pool) -> None:
     def act(order: PoolRequest) -> PoolResponse:
-        answer = pool.cluster.host.done(order, lambda _: None)
+        answer = pool.client.done(order)
         obstore.put(pool.objects, f"results/{order.job}/points.ply", b"other bytes")
         return answer
 
-    pool.cluster.acts = [act] * 2
+    pool.client.acts = [act] * 2
 
 
 def names_a_file_elsewhere(pool: Pool) -> None:
-    pool.cluster.acts = [lambda _: PoolResponse({}, {"../../record.json": "0" * 64})] * 2
+    pool.client.acts = [lambda order: PoolResponse(job=order.job, files={"../../record.json": "0" * 64})] * 2
 
 
 def is_slow(pool: Pool) -> None:
@@ -445,7 +319,6 @@ def is_full(pool: Pool) -> None:
     [
         (gone, 0, "does not answer"),
         (never_begins, 1, "has not begun"),
-        (falls_silent, 1, "nothing more was heard"),
         (is_lost_twice, 2, "lost the job"),
         (is_lost_for_good, 1, "lost the job"),
         (answers_wrong_bytes, 2, "not what was put there"),
@@ -463,30 +336,30 @@ def test_what_the_pool_fails_to_do_this_machine_does(
     (done,) = pool.local.done
     assert done.where["where"] == "local"
     assert re.search(because, done.where["because"])
-    assert len(pool.cluster.orders) == orders
-    assert {path for path in pool.tidied() if not path.startswith("stops/")} == set()
+    assert len(pool.client.orders) == orders
+    assert pool.tidied() == set()
 
 
 def test_a_job_that_was_lost_is_given_to_the_pool_again(pool: Pool, tmp_path: Path) -> None:
-    pool.cluster.acts = [lost]
+    pool.client.acts = [lost]
     assert pool.worker.run(job(tmp_path)).summary["seconds"] == 1.5
-    assert (len(pool.cluster.orders), len(pool.remote.done), pool.local.done) == (2, 2, [])
-    assert pool.tidied() == {f"stops/{pool.cluster.orders[0].order.job}"}
+    assert (len(pool.client.orders), len(pool.remote.done), pool.local.done) == (2, 2, [])
+    assert pool.tidied() == set()
 
 
 def test_what_fails_by_itself_fails_here_in_its_own_words(pool: Pool, tmp_path: Path) -> None:
     with pytest.raises(NothingToReconstructError, match="No stripe"):
         pool.worker.run(job(tmp_path, "fail"))
-    assert len(pool.cluster.orders) == 1
+    assert len(pool.client.orders) == 1
 
 
 def test_a_job_that_is_cancelled_is_stopped_where_it_is_computed(pool: Pool, tmp_path: Path) -> None:
-    pool.cluster.acts = [pool.passes(0.1)]
+    pool.client.acts = [pool.passes(0.1)]
     with pytest.raises(ScanCancelledError, match="reconstruction was cancelled"):
         pool.worker.run(job(tmp_path), cancelled=lambda: pool.now_s > 1)
-    (pending,) = pool.cluster.orders
+    (pending,) = pool.client.orders
     assert pending.cancelled()
-    assert pool.tidied() == {f"stops/{pending.order.job}"}
+    assert pool.tidied() == set()
     assert (pool.local.done, files(tmp_path)) == ([], {})
 
 
@@ -495,45 +368,35 @@ def test_frames_that_were_taken_here_are_computed_here(pool: Pool, tmp_path: Pat
     gone(pool)
     feed = pool.worker.feed()
     assert pool.local.feeds == [feed]
-    pool.cluster.there = True
+    pool.client.there = True
     pool.worker.run(job(tmp_path), feed=feed)
-    assert pool.cluster.orders == []
+    assert pool.client.orders == []
     assert pool.local.done[0].where == {"where": "local", "because": "the pool does not answer when the frames came"}
 
 
-def test_workers_of_other_versions_are_not_used_nor_those_of_a_pool_for_other_tasks(pool: Pool) -> None:
+def test_other_tasks_than_scans_are_computed_here(pool: Pool) -> None:
     assert pool.worker.run(Task(fake_pipeline.process_id, what="examination")) > 0
-    assert len(pool.local.done) == 1
-    cluster = DaskCluster("tcp://127.0.0.1:1", None)
-    mine, newer = ({"resources": {resource(found): 1}} for found in (versions(), {**versions(), "code": "0"}))
-    assert "no workers" in str(cluster._lack([]))
-    assert "this machine's versions" in str(cluster._lack([newer]))
-    assert cluster._lack([newer, mine]) is None
+    assert (len(pool.local.done), pool.client.orders) == (1, [])
 
 
-def test_workers_abilities_are_queried_when_they_change(monkeypatch: pytest.MonkeyPatch) -> None:
-    members = {"one": {"resources": {resource(versions()): 1}}}
-    asked: list[int] = []
+def test_a_pool_is_used_while_a_worker_has_this_machines_versions() -> None:
+    client, mine = PoolClient(PoolAddress("pool", 8786)), dict(versions())
+    for found, usable, why in (
+        ([], False, "no workers"), ([{**mine, "code": "0"}], False, "this machine's versions"),
+        ([{**mine, "code": "0"}, mine], True, ""), ([], False, "no workers"),
+    ):  # fmt: skip
+        client._heard(Workers(versions=found))
+        assert (client.usable(), why in client.fault) == (usable, True)
 
-    class Scheduler:
-        async def identity(self, n_workers: int) -> dict[str, object]:
-            asked.append(n_workers)
-            if len(asked) == 10:
-                members.clear()
-            if len(asked) == 20:
-                raise OSError("gone")
-            return {"n_workers": len(members), "workers": members if n_workers else {}}
 
-    monkeypatch.setattr("slrig.compute.pooled.LOOK_S", 0.0)
-    cluster = DaskCluster("tcp://127.0.0.1:1", None)
-    with pytest.raises(OSError, match="gone"):
-        asyncio.run(cluster._watch(SimpleNamespace(scheduler=Scheduler())))  # type: ignore[arg-type]
-    assert asked == [0, -1, *[0] * 8, -1, *[0] * 9]
-    assert not cluster.usable()
+def test_workers_use_no_folder_of_another_user(place: Path) -> None:
+    place.chmod(0o755)
+    with pytest.raises(ConfigError, match=f"{place.name} belongs to somebody else"), _scratch():
+        pass
 
 
 def test_a_service_that_ends_interrupts_what_is_in_the_pool(pool: Pool, tmp_path: Path) -> None:
-    pool.cluster.acts = [lambda _: pool.worker.close()]
+    pool.client.acts = [lambda _: pool.worker.close()]
     with pytest.raises(ScanInterruptedError):
         pool.worker.run(job(tmp_path))
 
@@ -552,29 +415,55 @@ def test_a_disk_that_is_full_is_no_fault_of_the_pool(
         pool.worker.run(task)
 
 
-def order(pool: Pool, folder: Path, what: str = "finish") -> PoolRequest:
+JOB = "0" * 32
+
+
+def order(pool: Pool, folder: Path, what: str = "finish", **forged: Any) -> PoolRequest:
+    """An order of a rig. forged : what of its task is somebody else's."""
     task = job(folder, what)
+    assert task.files is not None
     key = pool.store.put_bundle(folder / "staged" / "bundle", lambda: None)
-    return PoolRequest("job", key, task, "rig", versions())
+    given = PoolTask(id=task.files.id, bundle=key, plan=ScanPlan()).model_dump(mode="json")
+    return PoolRequest(job=JOB, versions=dict(versions()), task={**given, **forged})
 
 
 def fault(answer: PoolResponse) -> tuple[str, str]:
     assert answer.fault is not None
-    assert (answer.result, dict(answer.files)) == (None, {})
+    assert (answer.result, answer.files) == (None, {})
     return answer.fault.code, answer.fault.message
 
 
+@pytest.mark.parametrize(
+    "forged",
+    [
+        {"name": "os.system"},
+        {"name": "scan", "function": "gASVKQAAAAAAAACMBXBvc2l4lIwGc3lzdGVtlJOUjA50b3VjaCAvdG1wL3J1bpSFlFKULg=="},
+        {"plan": "gASVKQAAAAAAAACMBXBvc2l4lIwGc3lzdGVtlJOUjA50b3VjaCAvdG1wL3J1bpSFlFKULg=="},
+        {"plan": {"reconstruction": {"max_code_gap": 0}}},
+        {"bundle": "../../../etc/passwd"},
+        {"id": "../../scans"},
+    ],
+    ids=str,
+)
+def test_a_machine_refuses_what_is_no_scan_and_runs_nothing(
+    pool: Pool, tmp_path: Path, forged: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = order(pool, tmp_path, **forged)
+    monkeypatch.setattr(pool.store, "fetch_bundle", never)
+    assert fault(pool.client.done(given))[0] in {POOL_FAULT, "config"}
+    assert pool.remote.done == []
+
+
 def test_a_machine_answers_what_went_wrong(pool: Pool, tmp_path: Path) -> None:
-    answer = pool.cluster.host.done
+    answer = pool.client.done
     given = order(pool, tmp_path / "one")
-    newer = replace(given, versions={**versions(), "numba": "0"})
-    code, message = fault(answer(newer, lambda _: None))
+    code, message = fault(answer(given.model_copy(update={"versions": {**versions(), "numba": "0"}})))
     assert (code, "have changed" in message) == (POOL_FAULT, True)
     assert [task.what for task in pool.remote.done] == ["statement of versions"]
-    obstore.put(pool.objects, f"bundles/{given.bundle}.tar", b"another bundle")
-    assert "not what was put there" in fault(answer(given, lambda _: None))[1]
+    obstore.put(pool.objects, f"bundles/{given.task['bundle']}.tar", b"another bundle")
+    assert "not what was put there" in fault(answer(given))[1]
     for what, code in (("fail", "nothing-to-reconstruct"), ("break", "unexpected")):
-        assert fault(answer(order(pool, tmp_path / what, what), lambda _: None))[0] == code
+        assert fault(answer(order(pool, tmp_path / what, what)))[0] == code
 
 
 def test_a_machine_that_loses_its_process_leaves_the_job_to_another_try(
@@ -585,17 +474,21 @@ def test_a_machine_that_loses_its_process_leaves_the_job_to_another_try(
 
     given = order(pool, tmp_path)
     monkeypatch.setattr(pool.remote, "run", lost)
-    assert fault(pool.cluster.host.done(given, lambda _: None)) == (
-        POOL_FAULT,
-        "The worker's process ended (signal SIGKILL).",
-    )
+    assert fault(pool.client.done(given)) == (POOL_FAULT, "The worker's process ended (signal SIGKILL).")
+
+
+def test_a_result_that_cannot_be_sent_is_a_fault(pool: Pool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(task: Task, **_: object) -> object:
+        return versions() if task.files is None else Outcome({"figure": object()})
+
+    given = order(pool, tmp_path)
+    monkeypatch.setattr(pool.remote, "run", run)
+    assert fault(pool.client.host.done(given, lambda _: None, threading.Event()))[0] == "unexpected"
 
 
 def test_progress_is_sent_at_intervals(pool: Pool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given, heard = order(pool, tmp_path), list[Mapping[str, Any]]()
-
     def run(task: Task, *, progress: Callable[[str, float, str], None] = lambda *_: None, **_: object) -> object:
-        if not task.movable:
+        if task.files is None:
             return versions()
         for number in range(10):
             progress("read bundle", number / 10, "")
@@ -603,9 +496,10 @@ def test_progress_is_sent_at_intervals(pool: Pool, tmp_path: Path, monkeypatch: 
         progress("decode", 1.0, "")
         return None
 
+    given = order(pool, tmp_path)
     monkeypatch.setattr(pool.remote, "run", run)
-    assert pool.cluster.host.done(given, heard.append).fault is None
-    assert [each["fraction"] for each in heard if "stage" in each] == [0.0, 0.4, 0.8, 1.0]
+    assert pool.client.done(given).fault is None
+    assert [each.fraction for each in pool.client.told if each.stage] == [0.0, 0.4, 0.8, 1.0]
 
 
 def test_a_file_travels_while_the_next_one_is_made(pool: Pool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -617,46 +511,40 @@ def test_a_file_travels_while_the_next_one_is_made(pool: Pool, tmp_path: Path, m
         return digest
 
     def run(task: Task, *, made: Callable[[str], None] = lambda _: None, **_: object) -> object:
-        if not task.movable:
+        if task.files is None:
             return versions()
-        assert task.files is not None
         result = task.files.folder / RESULT
         result.mkdir()
         (result / "mesh.ply").write_bytes(b"ply")
         made("mesh.ply")
         assert gone.wait(30)
         (result / "report.json").write_bytes(b"{}")
-        return "the report"
+        return Outcome({"triangles": 1})
 
     monkeypatch.setattr(pool.store, "put_result", put_result)
     monkeypatch.setattr(pool.remote, "run", run)
-    answer = pool.cluster.host.done(given, lambda _: None)
-    assert answer.result == "the report"
-    assert dict(answer.files) == {
+    answer = pool.client.done(given)
+    assert answer.result == Outcome({"triangles": 1})
+    assert answer.files == {
         "mesh.ply": hashlib.sha256(b"ply").hexdigest(), "report.json": hashlib.sha256(b"{}").hexdigest()
     }  # fmt: skip
     assert {each["path"] for each in pool.objects.list("results").collect()} == {
-        "results/job/mesh.ply", "results/job/report.json"
+        f"results/{JOB}/mesh.ply", f"results/{JOB}/report.json"
     }  # fmt: skip
 
 
 def test_a_job_that_its_rig_gave_up_is_stopped_in_the_middle(pool: Pool, tmp_path: Path) -> None:
-    heard: list[Mapping[str, Any]] = []
+    def tell(_told: Progress) -> None:
+        if len(pool.remote.done) == 2:
+            pool.store.put_result(JOB, tmp_path / "staged" / "bundle" / "order", lambda: None)
+            stop.set()
 
-    def told(each: Mapping[str, Any]) -> None:
-        pool.now_s += BEAT_S
-        heard.append(each)
-        if len(heard) == 4:
-            pool.store.stop("job")
-
-    code, _ = fault(pool.cluster.host.done(order(pool, tmp_path, "hang"), told))
-    assert code == "scan-cancelled"
-    assert {"job": "job"} in heard[1:]
+    stop = threading.Event()
+    assert fault(pool.client.host.done(order(pool, tmp_path, "hang"), tell, stop))[0] == "scan-cancelled"
     assert not [each for each in pool.objects.list().collect() if each["path"].startswith("results/")]
-    # So is one whose machine leaves the pool.
-    leave: Any = pool.cluster.host.teardown
-    left = order(pool, tmp_path / "left", "hang")
-    assert fault(pool.cluster.host.done(left, lambda _: leave(None)))[0] == "scan-cancelled"
+    # So is one whose files are still on their way.
+    assert fault(pool.client.host.done(order(pool, tmp_path / "left"), tell, stop))[0] == "scan-cancelled"
+    assert len(pool.remote.done) == 3
 
 
 SECRET = "the-secret-of-the-store"  # noqa: S105 - nothing but a test's
