@@ -37,9 +37,7 @@ own = [each.name for package in (slrig, drivers, simulated_rig)
        for each in pkgutil.walk_packages(package.__path__, package.__name__ + ".")]
 # Run by themselves: by Alembic, by python -m, and on a microcontroller.
 apart = (".migrations.env", ".__main__", "device.main", "device.box")
-# A pool's machines are Linux: dask's own libraries load what that has.
-apart_too = "slrig.compute."
-own = [name for name in own if not name.endswith(apart) and not name.startswith(apart_too)]
+own = [name for name in own if not name.endswith(apart)]
 print(len([importlib.import_module(name) for name in own]))
 """
 
