@@ -149,6 +149,7 @@ class Desk:
             "patterns": {**plan, "line_shift": True, "rows": True, "codes": True},
             "shot": self.shot,
             "script": list(range(max(self.script - 1, 0))),
+            "pinned": False,
             "coverage": {**coverage, "missing": ["3 of at least 10 poses"]} if accepted else None,
             "next_move": {
                 "words": "move it to the lower right corner",
