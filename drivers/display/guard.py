@@ -6,6 +6,7 @@ import os
 import select
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Sequence
@@ -26,21 +27,23 @@ class GuardProcess:
 
     def __init__(self, module: str, task: str, output: str, handles: Sequence[int] = ()) -> None:
         self._lock = threading.Lock()
-        self._process = subprocess.Popen(  # noqa: S603 - our own program
-            [sys.executable, "-m", module, task],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            pass_fds=handles,
-            # An interrupt from the keyboard is for the watched process.
-            start_new_session=True,
-        )
-        if self._read_line(_START_TIMEOUT_S) != b"ready\n":
-            self.release()
-            message = (
-                f"no guard keeps output {output} black when slrig ends: its process ended or hangs; run it to see its "
-                f"error: {sys.executable} -m {module}"
+        # Not ours: it outlives this process, and whoever reads our errors to their end would wait for it.
+        with tempfile.TemporaryFile() as errors:
+            self._process = subprocess.Popen(  # noqa: S603 - our own program
+                [sys.executable, "-m", module, task],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                pass_fds=handles,
+                # An interrupt from the keyboard is for the watched process.
+                start_new_session=True,
             )
-            raise DeviceError(message)
+            if self._read_line(_START_TIMEOUT_S) != b"ready\n":
+                self.release()
+                errors.seek(0)
+                *_, cause = ["it hangs", *errors.read().decode(errors="replace").strip().splitlines()]
+                message = f"no guard keeps output {output} black when slrig ends: its process did not start ({cause})"
+                raise DeviceError(message)
 
     @property
     def is_alive(self) -> bool:
