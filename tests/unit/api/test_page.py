@@ -12,6 +12,7 @@ import pytest
 
 from slrig.api.rig import encoded, marked_picture
 from slrig.api.system import FOLDER, policy
+from tests.npm import npm_package
 from tests.unit.api.conftest import ServedBench
 from tests.unit.api.test_access import stranger
 
@@ -67,13 +68,26 @@ def test_modules_import_what_is_there() -> None:
     ] == []
 
 
-def test_libraries_are_those_that_the_readme_names() -> None:
-    text = (FOLDER / "README.md").read_text(encoding="utf-8")
-    named = dict(re.findall(r"^\| `([\w.-]+\.js)` \|.*`(\w{64})` \|$", text, re.MULTILINE))
-    found = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in (FOLDER / "vendor").glob("*.js")}
-    assert named == found
-    licences = {path.name for path in (FOLDER / "vendor").glob("LICENSE.*")}
-    assert licences == {"LICENSE.htm.txt", "LICENSE.preact.txt", "LICENSE.three.txt"}
+VENDORED = re.compile(
+    r"^\| `(?P<file>[\w.-]+)` \| \[(?P<name>\w+) (?P<version>[\d.]+)\]\(https://registry\.npmjs\.org/(?P=name)/-/(?P=name)-"
+    r"(?P=version)\.tgz\).* \| `(?P<source>[\w./]+)` \| `(?P<digest>\w{64})` \|$",
+    re.MULTILINE,
+)
+ROWS = [each.groupdict() for each in VENDORED.finditer((FOLDER / "README.md").read_text(encoding="utf-8"))]
+
+
+def test_vendored_files_are_those_that_the_readme_names() -> None:
+    found = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in (FOLDER / "vendor").iterdir()}
+    assert {row["file"]: row["digest"] for row in ROWS} == found
+    licensed = {row["name"] for row in ROWS if row["file"] == f"LICENSE.{row['name']}.txt"}
+    assert licensed == {row["name"] for row in ROWS}
+
+
+@pytest.mark.slow
+def test_vendored_files_are_those_that_npm_publishes() -> None:
+    for row in ROWS:
+        package = npm_package(f"{row['name']}@{row['version']}", "which slrig/page/vendor has files of")
+        assert (package / row["source"]).read_bytes() == (FOLDER / "vendor" / row["file"]).read_bytes(), row["file"]
 
 
 def test_the_page_is_small() -> None:
