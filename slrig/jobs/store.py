@@ -252,6 +252,9 @@ _LISTED: dict[str, str] = {
 }
 
 
+KEPT_PROGRESS = 20
+"""Jobs that are over and whose events of progress are still on record, for those who follow and are behind."""
+
 EVERY_JOB = UUID(int=0)
 """Stands for all jobs of a store where they are followed."""
 
@@ -473,6 +476,10 @@ class JobStore:
             self._close_row(session, row, state, fault, summary)
             ended = record_of(row)
             self.outbox.ended(session, ended)
+            # Whoever comes later wants to know how a job ended, not how far it was at each moment.
+            over = select(JobRow.id).where(JobRow.state.in_([each for each in JobState if each.final]))
+            older = over.order_by(JobRow.number.desc()).offset(KEPT_PROGRESS).limit(KEPT_PROGRESS)
+            session.execute(delete(EventRow).where(EventRow.kind == "progress", EventRow.job_id.in_(older)))
         self._wake(job_id, row.parent)
         self.after_end(ended)
         return True

@@ -19,7 +19,7 @@ from slrig.jobs import database as module
 from slrig.jobs.database import UNREADABLE, Base, Database, sqlite_engine
 from slrig.jobs.job import ProgressRecorder
 from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, Stage, stages_of
-from slrig.jobs.store import JobStore, RequestKeys
+from slrig.jobs.store import KEPT_PROGRESS, JobStore, RequestKeys
 from slrig.scan.job import plan_from_json, plan_json
 from slrig.scan.plan import PatternPlan, ScanPlan
 from tests.unit.scan.fakes import SetClock
@@ -50,6 +50,15 @@ def test_scan_comes_back_as_it_was_recorded(store: JobStore, clock: SetClock) ->
     assert store.get(made.id) == made
     assert (plan_from_json(made.plan), made.label, made.rig, made.state) == (plan, "cup", "bench", JobState.QUEUED)
     assert made.created_at == clock.now
+
+
+def test_progress_of_jobs_long_over_is_forgotten(store: JobStore) -> None:
+    made = [store.create({}, kind=JobKind.SCAN, rig="bench", label=None).id for _ in range(KEPT_PROGRESS + 2)]
+    for job in made:
+        store.progress(job, JobProgress("capture", 0.25, ""))
+        store.finish(job, JobState.SUCCEEDED)
+    kinds = [[event.kind for event in store.events(job, after=0)] for job in made]
+    assert kinds == [["state", "state"]] * 2 + [["state", "progress", "state"]] * KEPT_PROGRESS
 
 
 def test_life_of_a_scan_is_told_by_its_events_in_order(store: JobStore, clock: SetClock) -> None:
