@@ -16,7 +16,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, fie
 from slrig.bundle.calibration import Vector3
 from slrig.bundle.description import CameraName
 from slrig.bundle.storage import json_bytes
-from slrig.bundle.validation import AwareMoment, FreeText, Strict, read_json_model, read_toml, validate
+from slrig.bundle.validation import MAX_NUMBER, AwareMoment, FreeText, Strict, read_json_model, read_toml, validate
 from slrig.errors import ConfigError
 from slrig.model import (
     MAX_EXPOSURES,
@@ -38,7 +38,7 @@ _POSES_MAX_BYTES = 8 * 2**20
 _ROTATION_TOLERANCE = 3e-5
 """Largest difference of R Rᵀ from 1 in a rotation written with five digits."""
 
-PoseRow = Annotated[list[float], Field(min_length=4, max_length=4)]
+PoseRow = Annotated[list[Annotated[float, Field(ge=-MAX_NUMBER, le=MAX_NUMBER)]], Field(min_length=4, max_length=4)]
 
 MAX_HISTORY = 500
 """Number of changes of the axis that are kept: a model an hour for three weeks."""
@@ -64,7 +64,7 @@ class AxisEntry(Strict):
 
     @model_validator(mode="after")
     def _check_direction(self) -> Self:
-        if not np.linalg.norm(self.direction) > 0:
+        if not np.linalg.norm(self.direction) > 1e-30:
             raise ValueError("direction: expected a vector with a length, found zeros")
         return self
 
@@ -175,7 +175,7 @@ class PlaneEntry(Strict):
 
     @model_validator(mode="after")
     def _check_normal(self) -> Self:
-        if not np.linalg.norm(self.normal) > 0:
+        if not np.linalg.norm(self.normal) > 1e-30:
             raise ValueError("normal: expected a vector with a length, found zeros")
         return self
 

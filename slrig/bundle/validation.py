@@ -15,7 +15,16 @@ from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar
 
-from pydantic import AfterValidator, AwareDatetime, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    AwareDatetime,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+)
 from pydantic_core import ErrorDetails
 
 from slrig.errors import ConfigError, InvalidInputError
@@ -23,6 +32,7 @@ from slrig.printable import UNSAFE, unsafe
 
 MAX_FAULTS = 20
 MAX_VALUE_LENGTH = 60
+MAX_NUMBER = 1e60
 
 
 def _refuse_unsafe(text: str) -> str:
@@ -68,6 +78,22 @@ class Strict(BaseModel):
     """A description without unknown keys, without numbers that are not finite, and without silent conversions."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    @field_validator("*")
+    @classmethod
+    def _refuse_immense(cls, value: Any) -> Any:
+        """Refuse numbers whose squares and products overflow: nothing that is measured has such."""
+        pending = [value]
+        while pending:
+            each = pending.pop()
+            if isinstance(each, (list, tuple)):
+                pending.extend(each)
+            elif isinstance(each, dict):
+                pending.extend(each.values())
+            elif isinstance(each, (int, float)) and abs(each) > MAX_NUMBER:
+                message = f"expected numbers of at most {MAX_NUMBER:g}, found a greater one"
+                raise ValueError(message)
+        return value
 
 
 Described = TypeVar("Described", bound=BaseModel)

@@ -7,14 +7,19 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
+from uuid import UUID
 
 import cv2
 import numpy as np
 import pytest
+from fastapi.routing import iter_route_contexts
 from fastapi.testclient import TestClient
+from pydantic import BaseModel
 
+from slrig.api.app import bare_app
 from slrig.api.schemas import ScanRequest, scan_plan
+from slrig.bundle import Strict
 from slrig.bundle.description import MAX_CAPTURE_BYTES
 from slrig.bundle.options import Preset, PresetDocument, ScanDefaults
 from slrig.config import read_rig
@@ -93,6 +98,42 @@ def test_bad_request_is_refused_with_its_field(client: TestClient, body: Any, fi
     if words != "required":
         assert len(faults) == 1
     assert client.get("/scan").json()["scans"] == []
+
+
+ZERO = [0.0, 0.0, 0.0]
+PLANE = {"kind": "plate", "point_mm": ZERO, "sigma_mm": 0.0, "radius_mm": 0.0, "margin_mm": 0.0}
+TURNTABLE = {"format": "slrig-turntable", "version": 1}
+IDS = [str(UUID(int=1)), str(UUID(int=2))]
+
+
+IMMENSE = 1.7e308
+AXIS = {"point_mm": ZERO, "direction": [0.0, 1.0, 0.0]}
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body"),
+    [
+        ("POST", "/scan", in_region(box_mm=[[-IMMENSE, -1.0, -1.0], [IMMENSE, 1.0, 1.0]])),
+        ("POST", "/model", {"scans": IDS, "angles_deg": [0.0, -IMMENSE]}),
+        ("POST", "/model", {"scans": IDS, "axis": {**AXIS, "direction": [IMMENSE] * 3}}),
+        ("POST", "/model", {"scans": IDS, "poses": [[[IMMENSE] * 4] * 4] * 2}),
+        ("PUT", "/rig/turntable", {**TURNTABLE, "planes": [{**PLANE, "normal": [IMMENSE, 0.0, 0.0]}]}),
+        ("PUT", "/rig/turntable", {**TURNTABLE, "axis": {**AXIS, "covariance": [[10**61] * 6] * 6}}),
+    ],
+)
+def test_number_whose_square_overflows_is_refused(client: TestClient, method: str, path: str, body: Any) -> None:
+    told = client.request(method, path, json=body)
+    assert told.status_code == 422
+    words = " ".join(each["message"] for each in told.json()["errors"])
+    assert "expected numbers of at most 1e+60" in words or "less than or equal to 1000000000" in words
+
+
+def test_every_body_is_strict() -> None:
+    hints = [get_type_hints(each.endpoint) for each in iter_route_contexts(bare_app().routes) if each.endpoint]
+    named = [each for hint in hints for name, each in hint.items() if name != "return" and isinstance(each, type)]
+    bodies = [each for each in named if issubclass(each, BaseModel)]
+    assert len(bodies) >= 20
+    assert [each for each in bodies if not issubclass(each, Strict)] == []
 
 
 def test_every_fault_of_a_request_is_named(client: TestClient) -> None:
