@@ -386,7 +386,7 @@ def list_calibrations(service: Serving, limit: Annotated[int, Query(ge=1, le=200
 @router.post(
     "/import",
     status_code=201,
-    responses=problems(415, 507),
+    responses=problems(415, 503, 507),
     openapi_extra={
         "requestBody": {
             "required": True,

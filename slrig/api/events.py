@@ -71,9 +71,38 @@ class Followed:
     most: int | None = None
 
 
-def _answers(events: str, nothing: str | None = None) -> dict[int | str, dict[str, Any]]:
+_TEXT: dict[str, Any] = {"type": "string"}
+_MOMENT: dict[str, Any] = {"type": "string", "format": "date-time"}
+_FAULT: dict[str, Any] = {"anyOf": [{"$ref": "#/components/schemas/Problem"}, {"type": "null"}]}
+_DATA: dict[str, dict[str, Any]] = {
+    "progress": {"stage": _TEXT, "fraction": {"type": "number", "minimum": 0, "maximum": 1}, "detail": _TEXT},
+    "captured": {"time": _MOMENT},
+    "file": {"name": _TEXT},
+    "state": {"time": _MOMENT, "error": _FAULT},
+    "pose": {"time": _MOMENT, "error": _FAULT, "pose": {"type": "integer"}},
+}
+"""What the data of an event hold, by its kind, beside the state of its job."""
+
+
+def _event(kind: str, **more: dict[str, Any]) -> dict[str, Any]:
+    data = {"state": _TEXT, **_DATA[kind], **more}
+    required = [name for name in data if data[name] is not _FAULT]
+    content = {"type": "object", "properties": data, "required": required}
+    told = {"type": "string", "contentMediaType": "application/json", "contentSchema": content}
     return {
-        200: {"description": events, "content": {"text/event-stream": {"schema": {"type": "string"}}}},
+        "type": "object",
+        "properties": {"id": {"type": "string", "pattern": "^[0-9]+$"}, "event": {"const": kind}, "data": told},
+        "required": ["id", "event", "data"],
+    }
+
+
+def _answers(
+    events: str, items: Sequence[dict[str, Any]], nothing: str | None = None
+) -> dict[int | str, dict[str, Any]]:
+    # As OpenAPI 3.2 has it, and as FastAPI writes it for its own streams.
+    stream = {"schema": {"type": "string"}, "itemSchema": {"anyOf": items}}
+    return {
+        200: {"description": events, "content": {"text/event-stream": stream}},
         **({} if nothing is None else {204: {"description": nothing}}),
         **problems(429),
     }
@@ -139,12 +168,18 @@ _EVERYTHING = _answers(
     "the events of scans, verifications, poses, solves, positions and models, as the streams of their own have them, "
     "each with `job`: its `id`, `kind` and `label`, the `series`, `calibration` or `acceptance` that it belongs to, "
     "and `links`. Event numbers rise, with gaps. Without a number to begin after, the stream begins with what comes "
-    "from now on, and says first after which number that is. It ends with the service."
+    "from now on, and says first after which number that is. It ends with the service.",
+    [
+        *(_event(kind, job={"type": "object"}) for kind in ("progress", "captured", "file", "state")),
+        {"type": "object", "properties": {"id": _TEXT}, "required": ["id"], "not": {"required": ["data"]}},
+    ],
 )
 _JOB = _answers(
     "`progress` events with stage, fraction and detail; `captured` when the rig is free of the job, whose "
     "frames are brought to disk and computed with then; `file` events with the name of a file that can be fetched from "
-    "then on; `state` events with the new state. The stream ends after the event of a final state.",
+    "then on; `state` events with the new state. The stream ends after the event of a final state. Of jobs that are "
+    "long over there is no `progress`.",
+    [_event(kind) for kind in ("progress", "captured", "file", "state")],
     "nothing has happened since the event that was named, and nothing more will",
 )
 _CALIBRATION = _answers(
@@ -152,6 +187,11 @@ _CALIBRATION = _answers(
     "the number of the pose; `captured` when the rig is free of a pose, and the board may be moved; `state` events "
     "when a solve begins (`solving`) and ends (`solved`, `failed`). The stream ends when nothing is under way any "
     "more. Event numbers rise, with gaps.",
+    [
+        *(_event(kind, pose={"type": ["integer", "null"]}) for kind in ("progress", "captured")),
+        _event("pose"),
+        _event("state"),
+    ],
     "nothing has happened since the event that was named, and nothing is under way",
 )
 

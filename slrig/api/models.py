@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field, model_validator
 
 from slrig.api.files import KnownTag, file_answers, kept_file, refuse_absent, require_whole
 from slrig.api.problems import problems
-from slrig.api.schemas import AskedPlan, JobBody, JobLinks, ShotRequest, filled, scan_plan
+from slrig.api.schemas import AskedPlan, JobBody, JobLinks, ListedJob, ShotRequest, filled, listed_links, scan_plan
 from slrig.api.service import Cursor, IdempotencyKey, PageLength, Service, Serving, once, paged, started_once
 from slrig.bundle import MAX_VIEWS, AxisEntry, FreeText, PoseEntry, SafeText, Strict, orthonormalise_pose
 from slrig.calibrate.verification import require_healthy
@@ -20,6 +20,7 @@ from slrig.model_jobs.plan import (
     MARKER_DICTIONARY,
     MEDIA_TYPES,
     MOST_VIEWS,
+    SIDES,
     START_ERROR_MM,
     GivenPoses,
     MarkerPoses,
@@ -113,10 +114,16 @@ class ModelBody(JobBody):
     links: JobLinks
 
 
+class ListedModel(ListedJob):
+    """A model in a list."""
+
+    views: int | None = Field(description="how many it was made of; null before")
+
+
 class ModelPage(BaseModel):
     """Models from new to old. `next` asks for the page after this one, null on the last."""
 
-    models: list[ModelBody]
+    models: list[ListedModel]
     next: str | None
 
 
@@ -145,7 +152,7 @@ def list_models(service: Serving, response: Response, cursor: Cursor = None, lim
         return store.page(JobKind.MODEL, before=cursor, limit=most)
 
     shown, following = paged(found, limit, "/model", service, response)
-    return ModelPage(models=[model_body(service, record) for record in shown], next=following)
+    return ModelPage(models=[_listed(service, record) for record in shown], next=following)
 
 
 @router.get("/{model_id}")
@@ -202,6 +209,12 @@ for _name, _media_type in MEDIA_TYPES.items():
         operation_id=f"fetch_model_{_name.removeprefix('model.').replace('.', '_')}",
         summary=f"Fetch {_name} of a model",
     )
+
+
+def _listed(service: Service, record: JobRecord) -> ListedModel:
+    found = {name: (record.summary or {}).get(name) for name in ("views", "triangles", "sigma_mm")}
+    links = listed_links(record, service.models.place(record.id), SIDES)
+    return filled(ListedModel, record, error=record.fault, links=links, **found)
 
 
 def model_body(service: Service, record: JobRecord) -> ModelBody:

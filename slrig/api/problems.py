@@ -14,6 +14,7 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from slrig.api.scopes import needed_scope
@@ -126,6 +127,7 @@ def install_problems(app: FastAPI) -> None:
     app.add_exception_handler(SlrigError, _slrig_error)
     app.add_exception_handler(RequestValidationError, _invalid_request)
     app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(ClientDisconnect, _gone)
     app.add_exception_handler(Exception, _unexpected)
 
 
@@ -155,6 +157,11 @@ async def _http_error(_request: Request, error: Exception) -> JSONResponse:
     text = str(error.detail)
     detail = _PLAIN_DETAILS.get(text, text if text != status.phrase else status.description or status.phrase)
     return answer(http_problem(status, detail), headers=error.headers)
+
+
+async def _gone(_request: Request, _error: Exception) -> JSONResponse:
+    # For the measurements and the audit: nobody reads it.
+    return answer(http_problem(HTTPStatus.BAD_REQUEST, "The client went away before all of its request was here."))
 
 
 async def _unexpected(_request: Request, error: Exception) -> JSONResponse:
@@ -281,6 +288,8 @@ def describe(app: FastAPI) -> dict[str, Any]:
     document["security"] = [{"bearer": []}, {"header": []}, {"session": []}]
     for path, operations in document["paths"].items():
         for method, operation in operations.items():
+            for parameter in operation.get("parameters", ()):
+                _without_null(parameter)
             answers = operation["responses"]
             for status, found in list(answers.items()):
                 if "HTTPValidationError" in json.dumps(found):
@@ -299,6 +308,14 @@ def describe(app: FastAPI) -> dict[str, Any]:
                 operation["x-scope"] = str(needed_scope(method.upper(), path))
     app.openapi_schema = document
     return document
+
+
+def _without_null(parameter: dict[str, Any]) -> None:
+    """Describe a parameter that may be left out as that: in a path, a query or a header there is no null."""
+    schema = parameter["schema"]
+    if "anyOf" in schema:
+        (meant,) = (each for each in schema["anyOf"] if each != {"type": "null"})
+        parameter["schema"] = {**meant, **{key: value for key, value in schema.items() if key != "anyOf"}}
 
 
 def text(app: FastAPI) -> str:

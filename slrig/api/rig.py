@@ -56,7 +56,7 @@ from slrig.errors import CalibrationError, CalibrationStateError, ConfigError, S
 from slrig.jobs.job import Job
 from slrig.jobs.manager import RigStatus
 from slrig.jobs.records import RIG_JOBS, JobKind, JobRecord, JobState, utc_now
-from slrig.jobs.worker import Task
+from slrig.jobs.worker import REQUEST_WAIT_S, Task
 from slrig.model_jobs.job import turntable_planes
 from slrig.model_jobs.turntable import TurntableState, state_of, turntable_svg
 from slrig.rig.preview import Light, Watch
@@ -599,7 +599,7 @@ def calibrate_turntable(service: Serving, request: Annotated[AxisRequest, Body()
         raise ConfigError(message)
     observed = [accepted[number].observation for number in numbers]
     given = (observed, board, calibration, request.angles_deg)
-    found = service.worker.run(Task(turntable_axis, given, what="axis of the turntable"))
+    found = service.worker.run(Task(turntable_axis, given, what="axis of the turntable"), within_s=REQUEST_WAIT_S)
     turntable = service.turntable.put_axis(found.axis.measured_axis, source=AxisSource.BOARD, of=str(record.id))
     poses = [
         TurntablePose(
@@ -635,7 +635,10 @@ def find_planes(service: Serving, request: Annotated[PlanesRequest, Body()]) -> 
         )
         raise ScanStateError(message)
     require_whole(service, scan, mesh.parent, MESH)
-    found = service.worker.run(Task(turntable_planes, (mesh, service.turntable.axis()), what="planes of the turntable"))
+    found = service.worker.run(
+        Task(turntable_planes, (mesh, service.turntable.axis()), what="planes of the turntable"),
+        within_s=REQUEST_WAIT_S,
+    )
     return _turntable(service.turntable.put_planes(found))
 
 

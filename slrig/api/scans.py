@@ -12,7 +12,18 @@ from pydantic import BaseModel, Field
 
 from slrig.api.files import ready_files
 from slrig.api.problems import problems
-from slrig.api.schemas import PatternRequest, ScanBody, ScanPage, ScanRequest, ScanSeries, filled, scan_body, scan_plan
+from slrig.api.schemas import (
+    ListedScan,
+    PatternRequest,
+    ScanBody,
+    ScanPage,
+    ScanRequest,
+    ScanSeries,
+    filled,
+    listed_links,
+    scan_body,
+    scan_plan,
+)
 from slrig.api.service import Cursor, IdempotencyKey, PageLength, Service, Serving, paged, started_once
 from slrig.bundle import PresetDocument, PresetName, Strict
 from slrig.calibrate.verification import require_healthy
@@ -66,7 +77,7 @@ def list_scans(
         return store.page(JobKind.SCAN, before=cursor, limit=most)
 
     shown, following = paged(found, limit, "/scan", service, response)
-    return ScanPage(scans=[_body(service, record) for record in shown], next=following)
+    return ScanPage(scans=[_listed(service, record) for record in shown], next=following)
 
 
 @router.get("/{scan_id}")
@@ -119,6 +130,19 @@ def unpin_scan(service: Serving, scan_id: UUID) -> ScanBody:
 def delete_scan(service: Serving, scan_id: UUID) -> None:
     """Delete a finished scan with all its files."""
     service.delete_scan(scan_id)
+
+
+def _listed(service: Service, record: JobRecord) -> ListedScan:
+    mesh = (record.summary or {}).get("mesh") or {}
+    return filled(
+        ListedScan,
+        record,
+        error=record.fault,
+        triangles=(mesh.get("figures") or {}).get("triangles"),
+        sigma_mm=(mesh.get("sigma_mm") or {}).get("p50"),
+        turn_deg=record.plan.get("turn_deg"),
+        links=listed_links(record, service.folder.scan(record.id), "preview.png"),
+    )
 
 
 def _body(service: Service, record: JobRecord) -> ScanBody:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from datetime import datetime
+from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 from uuid import UUID
 
@@ -305,8 +306,8 @@ AskedPlan = Annotated[
 ]
 
 
-class JobBody(BaseModel):
-    """A job on record."""
+class JobFacts(BaseModel):
+    """What every job on record has."""
 
     id: UUID
     state: JobState
@@ -317,8 +318,31 @@ class JobBody(BaseModel):
     finished_at: datetime | None
     progress: ProgressBody
     error: FaultBody
+
+
+class JobBody(JobFacts):
+    """A job on record."""
+
     summary: dict[str, Any] | None = Field(description="the plain figures and the notes of report.json")
     requested_by: str | None = Field(description="the name of the key, or the schedule, that asked for it")
+
+
+class ListedLinks(BaseModel):
+    """Where to go from a list. `self` has everything else; `picture` is null where there is none yet."""
+
+    self: str
+    events: str
+    cancel: str
+    picture: str | None
+
+
+class ListedJob(JobFacts):
+    """A scan or a model in a list."""
+
+    pinned: bool = Field(description="kept, whatever the settings say of old ones")
+    triangles: int | None = Field(description="of its mesh; null without one")
+    sigma_mm: float | None = Field(description="median of the standard deviations of the mesh's points")
+    links: ListedLinks
 
 
 class ScanBody(JobBody):
@@ -329,16 +353,29 @@ class ScanBody(JobBody):
     links: ScanLinks
 
 
+class ListedScan(ListedJob):
+    """A scan in a list."""
+
+    turn_deg: float | None = Field(description="angle of the turntable; null where nothing was turned")
+
+
 class ScanSeries(BaseModel):
     """The scans of a series that are on record, in their order."""
 
     scans: list[ScanBody]
 
 
+def listed_links(record: JobRecord, place: Path, picture: str) -> ListedLinks:
+    """The links of a scan or a model in a list. place : its folder. picture : the name of the one that it may have."""
+    here = f"{record.kind.path}/{record.id}"
+    shown = f"{here}/{picture}" if record.state.final and (place / picture).is_file() else None
+    return ListedLinks(self=here, events=f"{here}/events", cancel=f"{here}/cancel", picture=shown)
+
+
 class ScanPage(BaseModel):
     """Scans from new to old. `next` asks for the page after this one, null on the last."""
 
-    scans: list[ScanBody]
+    scans: list[ListedScan]
     next: str | None
 
 

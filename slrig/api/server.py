@@ -17,11 +17,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from types import FrameType
-from typing import Any
+from typing import Any, get_args
 
 import h11
 import structlog
 import uvicorn
+from pydantic import SecretStr
 from starlette.concurrency import run_in_threadpool
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -411,6 +412,7 @@ def serve(
         The address is taken.
     """
     set_up_logs(settings.log_level, settings.log_format)
+    given = take_secrets()
     # Whatever is written from now on is for the service's user alone, or may be read by one group.
     os.umask(0o077 if settings.data_group is None else 0o027)
     # uvicorn catches SIGTERM while it serves, ends in good order, and then raises it again: here it must not kill the
@@ -439,7 +441,7 @@ def serve(
         raise
     address, ended = service.folder.root / ADDRESS_FILE, threading.Event()
     try:
-        ring = _keys(settings, fresh=new_key) if settings.require_key else None
+        ring = _keys(settings, given, fresh=new_key) if settings.require_key else None
         app = create_app(service, ring=ring, cookie=f"slrig_session_{port}")
         say(f"slrig serves rig '{rig.name}' at {url}, data in {service.folder.root}. Ctrl-C stops it.")
         if ring is not None:
@@ -510,13 +512,21 @@ def _tell_preparation(service: Service, say: Callable[[str], None], ended: threa
         say("kernels are ready" if status.reconstruction == READY else status.reconstruction)
 
 
-def _keys(settings: ServiceSettings, *, fresh: bool) -> KeyRing:
-    # It is not for the processes that the service starts.
-    given = os.environ.pop(KEY_VARIABLE, None)
-    if given and fresh:
+def take_secrets() -> str | None:
+    """Take what is secret out of the environment, which the processes that the service starts are given; return the
+    key.
+    """
+    for name, field in ServiceSettings.model_fields.items():
+        if SecretStr in get_args(field.annotation):
+            os.environ.pop(f"SLRIG_{name}".upper(), None)
+    return os.environ.pop(KEY_VARIABLE, None) or None
+
+
+def _keys(settings: ServiceSettings, given: str | None, *, fresh: bool) -> KeyRing:
+    if given is not None and fresh:
         message = f"--new-key asks for a new key, and {KEY_VARIABLE} holds the one to use. Leave out one of the two."
         raise ConfigError(message)
-    return KeyRing(settings.key_path, given=given or None)
+    return KeyRing(settings.key_path, given=given)
 
 
 def _tell_keys(

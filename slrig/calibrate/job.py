@@ -64,7 +64,7 @@ from slrig.jobs.job import Job, JobRun, Outcome, Recording
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import Holder, JobKind, utc_now
 from slrig.jobs.retention import Kept
-from slrig.jobs.worker import Task
+from slrig.jobs.worker import REQUEST_WAIT_S, Task
 from slrig.model import Calibration, Size
 from slrig.rig.session import ActiveCalibration, RigFacts, RigSession
 from slrig.scan.acquisition import capture_frames
@@ -661,7 +661,7 @@ class Calibrations:
                 write_durably(source, text)
             try:
                 task = Task(read_calibration, (source,), what="reading of the calibration")
-                calibration: Calibration = self._manager.worker.run(task)
+                calibration: Calibration = self._manager.worker.run(task, within_s=REQUEST_WAIT_S)
             except CalibrationError as error:
                 message = str(error).replace(str(source), "the calibration sent")
                 raise CalibrationError(message) from error
@@ -798,13 +798,15 @@ class Calibrations:
             message = f"Calibration {session_id} has no device '{chosen}'; it has {', '.join(names)}."
             raise CameraNotFoundError(message)
         given = (self.store.folder(session_id), chosen, record.next_move or {})
-        picture: bytes = self._manager.worker.run(Task(coverage_picture, given, what="picture of the coverage"))
+        picture: bytes = self._manager.worker.run(
+            Task(coverage_picture, given, what="picture of the coverage"), within_s=REQUEST_WAIT_S
+        )
         return picture
 
     def compare(self, first: UUID, second: UUID) -> Comparison:
         """Return what the second says otherwise than the first. Raises as `calibration` does."""
         given = (self.calibration(first), self.calibration(second))
-        found: Comparison = self._manager.worker.run(Task(compare, given, what="comparison"))
+        found: Comparison = self._manager.worker.run(Task(compare, given, what="comparison"), within_s=REQUEST_WAIT_S)
         return found
 
     def latest(self) -> Sequence[SessionRecord]:

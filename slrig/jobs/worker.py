@@ -680,6 +680,10 @@ def job_task(job: Job, run: JobRun) -> Task:
     return Task(job.compute, (), files, what=job.noun, remedy=job.remedy)
 
 
+REQUEST_WAIT_S = 30.0
+"""How long a request waits for the worker to begin; then its client, who waits a minute, is told to come again."""
+
+
 class Compute(Protocol):
     """Does tasks for the service. Any thread may call. `slrig.jobs.worker.Worker` says what each part does."""
 

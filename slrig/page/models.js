@@ -28,9 +28,9 @@ function All({rig, may}) {
       <${Refusal} problem=${problem?.status ? problem : null} />
       ${list && models.length === 0 && html`<p class="quiet">None yet. Turn an object before the rig, and shoot it from all sides.</p>`}
       <ul class="cards">${models.map((model) => html`<li><a class="card" href=${`#/models/${model.id}`}>
-        ${model.links.files["sides.png"] ? html`<img src=${model.links.files["sides.png"]} alt="" loading="lazy" />` : html`<span class="none" aria-hidden="true">no picture</span>`}
+        ${model.links.picture ? html`<img src=${model.links.picture} alt="" loading="lazy" />` : html`<span class="none" aria-hidden="true">no picture</span>`}
         <span class="between"><span>${model.label ?? moment(model.created_at)}</span><${JobBadge} state=${model.state} /></span>
-        ${model.summary && html`<span class="quiet">${model.summary.views} views, ${count(model.summary.triangles)} triangles, σ ${length(model.summary.sigma_mm)}</span>`}
+        ${model.triangles !== null && html`<span class="quiet">${model.views} views, ${count(model.triangles)} triangles, σ ${length(model.sigma_mm)}</span>`}
         ${!over(model) && html`<span class="quiet">${model.progress.detail || model.progress.stage}</span>`}
         ${model.error && html`<span class="quiet clip">${model.error.detail}</span>`}
       </a></li>`)}</ul>
@@ -67,7 +67,7 @@ function Join() {
     ${list && scans.length < 2 ? html`<p class="quiet">It takes two scans that know the angle of their turntable.</p>` : html`
       <div class="wide pick"><table><thead><tr><th>Scan</th><th>Turntable</th><th>In the model</th></tr></thead>
         <tbody>${scans.map((scan) => html`<tr><th scope="row"><a href=${`#/scan/${scan.id}`}>${scan.label ?? moment(scan.created_at)}</a></th>
-          <td>${scan.plan.turn_deg === null || scan.plan.turn_deg === undefined ? "–" : `${Number(scan.plan.turn_deg.toFixed(2))}°`}</td>
+          <td>${scan.turn_deg === null ? "–" : `${Number(scan.turn_deg.toFixed(2))}°`}</td>
           <td><label><input type="checkbox" checked=${chosen.includes(scan.id)} onChange=${() => toggle(scan.id)} /> ${chosen.includes(scan.id) ? `view ${chosen.indexOf(scan.id) + 1}` : "no"}</label></td></tr>`)}</tbody></table></div>
       <${Action} busy=${busy} disabled=${chosen.length < 2} onClick=${start}>Make one model of ${chosen.length}<//>
       <${Refusal} problem=${refused} />`}

@@ -61,7 +61,7 @@ function Result({scan, again, may}) {
           <${Progress} label=${told.stage} fraction=${told.fraction} detail=${told.detail} /></div>`}
         ${hasMesh && html`<${Mesh} key=${scan.id} scan=${scan} other=${other} report=${report} again=${may("scan") ? limitToBox : null} />`}
         ${over && !hasMesh && html`<${Ended} scan=${scan} may=${may} />`}
-        ${over && hasMesh && html`<${Compare} scan=${scan} other=${other} chosen=${setOther} />`}
+        ${over && hasMesh && html`<${Compare} scan=${scan} chosen=${setOther} />`}
       </section>
       <section aria-label="Figures">
         <${Refusal} problem=${refused} />
@@ -124,18 +124,16 @@ function figures({summary}) {
   ];
 }
 
-function Compare({scan, other, chosen}) {
+function Compare({scan, chosen}) {
   const [list, problem] = useValue("/scan?limit=50");
   const [id, setId] = useState("");
-  const possible = (list?.scans ?? []).filter((each) => each.id !== scan.id && MESH in each.links.files && OVER.includes(each.state));
-  const choose = (event) => {
-    setId(event.target.value);
-    chosen(possible.find((each) => each.id === event.target.value) ?? null);
-  };
+  const possible = (list?.scans ?? []).filter((each) => each.id !== scan.id && each.triangles !== null && OVER.includes(each.state));
+  const [other] = useValue(id ? `/scan/${id}` : null);
+  useEffect(() => chosen(id ? other : null), [id, other]);
   const rows = other?.summary?.mesh && scan.summary?.mesh ? figures(scan).map((row, at) => [...row, figures(other)[at][1]]) : [];
   return html`<h3>Compare</h3><${Refusal} problem=${problem?.status ? problem : null} />
     ${list && possible.length === 0 ? html`<p class="quiet">There is no other scan with a mesh yet.</p>` : html`
-      <label>with <select value=${id} onChange=${choose}>
+      <label>with <select value=${id} onChange=${(event) => setId(event.target.value)}>
         <option value="">no other scan</option>
         ${possible.map((each) => html`<option value=${each.id}>${each.label ?? "Scan"}, ${moment(each.created_at)}</option>`)}
       </select></label>`}

@@ -75,13 +75,11 @@ function UnderWay({scan, changed, may}) {
 }
 
 function Card({scan}) {
-  const figures = scan.summary?.mesh?.figures;
-  const sigma_mm = scan.summary?.mesh?.sigma_mm?.p50;
-  const picture = scan.links.files["preview.png"];
+  const {picture} = scan.links;
   return html`<li><a class="card" href=${`#/scan/${scan.id}`}>
     ${picture ? html`<img src=${picture} alt="" loading="lazy" />` : html`<span class="none" aria-hidden="true">no picture</span>`}
     <span class="between"><span>${scan.label ?? moment(scan.created_at)}</span><${JobBadge} state=${scan.state} /></span>
-    ${figures && html`<span class="quiet">${count(figures.triangles)} triangles, σ ${length(sigma_mm)}</span>`}
+    ${scan.triangles !== null && html`<span class="quiet">${count(scan.triangles)} triangles, σ ${length(scan.sigma_mm)}</span>`}
     ${scan.error && html`<span class="quiet clip">${scan.error.detail}</span>`}
   </a></li>`;
 }

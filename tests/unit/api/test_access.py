@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 from collections.abc import AsyncIterator, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -17,7 +18,6 @@ from sse_starlette import EventSourceResponse
 from starlette.types import Receive, Send
 from starlette.types import Scope as ASGIScope
 
-from slrig import KEY_VARIABLE
 from slrig.api import auth as access
 from slrig.api.app import bare_app, create_app
 from slrig.api.auth import (
@@ -35,7 +35,7 @@ from slrig.api.auth import (
 )
 from slrig.api.problems import _CODES, explanations, text
 from slrig.api.scopes import READING, KeyScope, needed_scope
-from slrig.api.server import _keys
+from slrig.api.server import _keys, take_secrets
 from slrig.config import ServiceSettings
 from slrig.errors import ConfigError, StorageError
 from slrig.failure import errors_by_code
@@ -55,7 +55,7 @@ def test_table_of_statuses_is_the_whole_error_tree() -> None:
     assert sorted(code for codes in _CODES.values() for code in codes.split()) == sorted(tree)
 
 
-def test_given_key_that_protects_nothing_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_given_key_that_protects_nothing_is_refused(tmp_path: Path) -> None:
     for given, words in (
         ("x" * 15, "found 15"),
         ("schlüssel" * 4, "found 36, and others"),
@@ -63,14 +63,25 @@ def test_given_key_that_protects_nothing_is_refused(tmp_path: Path, monkeypatch:
     ):
         with pytest.raises(ConfigError, match=f"SLRIG_API_KEY: expected a key of 16 or more .* {words}"):
             KeyRing(tmp_path / "keys.json", given=given)
-    monkeypatch.setenv(KEY_VARIABLE, "x" * 16)
     with pytest.raises(ConfigError, match="--new-key asks for a new key, and SLRIG_API_KEY holds the one to use"):
-        _keys(ServiceSettings(data_dir=tmp_path), fresh=True)
+        _keys(ServiceSettings(data_dir=tmp_path), "x" * 16, fresh=True)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_processes_that_the_service_starts_are_given_no_secret(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("SLRIG_API_KEY", "SLRIG_WEBHOOK_SECRET", "SLRIG_MQTT_LOGIN", "SLRIG_CATALOGUE_LOGIN"):
+        monkeypatch.setenv(name, "a secret of theirs")
+    assert take_secrets() == "a secret of theirs"
+    assert "a secret of theirs" not in os.environ.values()
 
 
 def test_openapi_document_in_config_is_up_to_date() -> None:
     assert OPENAPI.read_text(encoding="utf-8") == text(bare_app()), "run: python -m slrig.api > config/openapi.json"
+
+
+def test_parameters_are_left_out_and_never_null() -> None:
+    for operation in (each for operations in PATHS.values() for each in operations.values()):
+        assert "null" not in str([each["schema"] for each in operation.get("parameters", ())])
 
 
 def test_every_refusal_is_documented_as_a_problem() -> None:

@@ -70,6 +70,12 @@ def test_scan_is_accepted_followed_and_fetched(client: TestClient) -> None:
     assert [event["id"] for event in events] == list(range(1, len(events) + 1))
     assert events[-1]["state"] == "succeeded"
     assert {event["stage"] for event in events if event["kind"] == "progress"} >= {"capture", "decode"}
+    answers = client.get("/openapi.json").json()["paths"]["/scan/{scan_id}/events"]["get"]["responses"]
+    items = [each["properties"] for each in answers["200"]["content"]["text/event-stream"]["itemSchema"]["anyOf"]]
+    contents = {item["event"]["const"]: item["data"]["contentSchema"] for item in items}
+    for event in events:
+        content = contents[event["kind"]]
+        assert set(content["required"]) <= event.keys() - {"id", "kind"} <= set(content["properties"])
     # A stream that broke off goes on after the last event that the client has.
     assert events_of(client.get(path, headers={"Last-Event-ID": "3"}).text) == events[3:]
     over = client.get(path, headers={"Last-Event-ID": str(len(events))})
@@ -151,6 +157,11 @@ def test_series_is_one_request_and_many_scans_on_pages(client: TestClient) -> No
     ]
     page = client.get("/scan", params={"limit": 2})
     assert [scan["id"] for scan in page.json()["scans"]] == [scans[2]["id"], scans[1]["id"]]
+    line = page.json()["scans"][0]
+    assert (line["state"], line["triangles"], line["turn_deg"]) == ("succeeded", None, None)
+    assert client.get(line["links"]["picture"]).status_code == 200
+    # A list stays short: what else there is, each scan says itself.
+    assert len(page.content) < 2 * 800
     assert page.headers["Link"] == f'<{page.json()["next"]}>; rel="next"'
     last = client.get(page.json()["next"])
     assert [scan["id"] for scan in last.json()["scans"]] == [first["id"]]
@@ -602,6 +613,14 @@ def test_request_waits_for_its_turn_and_not_for_ever(
         assert not any(each.done() for each in asked)
         busy.touch()
         assert [each.result(WAIT_S).status_code for each in asked] == [200, 200]
+
+
+@pytest.mark.usefixtures("busy")
+def test_import_waits_for_its_turn_and_not_for_ever(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("slrig.calibrate.job.REQUEST_WAIT_S", 0.05)
+    sent = {"content": b"{}", "headers": {"Content-Type": "application/json"}}
+    assert refusal(client, "POST", "/calibration/import", **sent) == (503, "/problems/worker-busy")
+    assert client.get("/calibration").json()["calibrations"] == []
 
 
 def test_scan_that_is_deleted_meanwhile_is_not_found(

@@ -256,13 +256,14 @@ def test_bad_number_of_an_event_is_refused(client: TestClient) -> None:
         assert client.get(path, headers=headers).status_code == 422
 
 
-def asked(app: FastAPI, path: str, gone: asyncio.Event) -> asyncio.Future[int]:
-    """The status of an answer to a client that stays until `gone` is set."""
+def asked(app: FastAPI, path: str, gone: asyncio.Event, *, method: str = "GET") -> asyncio.Future[int]:
+    """The status of an answer to a client that stays until `gone` is set, and until then has not sent all."""
     status: asyncio.Future[int] = asyncio.get_running_loop().create_future()
     scope = {
-        "type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "GET", "path": path,
+        "type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": method, "path": path,
         "raw_path": path.encode(), "query_string": b"", "root_path": "", "scheme": "http", "client": ("127.0.0.1", 1),
-        "server": ("127.0.0.1", 80), "headers": [(b"host", b"127.0.0.1"), (b"x-api-key", KEY.encode())],
+        "server": ("127.0.0.1", 80),
+        "headers": [(b"host", b"127.0.0.1"), (b"x-api-key", KEY.encode()), (b"content-type", b"application/json")],
     }  # fmt: skip
 
     async def receive() -> dict[str, str]:
@@ -307,6 +308,15 @@ async def test_client_that_is_gone_before_its_stream_begins_keeps_no_place(
     gone.set()
     await asked(served.app, served.held(client)["links"]["events"], gone)
     assert not served.service.streams.taken
+
+
+@on_loop
+async def test_upload_whose_client_goes_away_is_no_fault(client: TestClient, served: ServedBench) -> None:
+    gone = asyncio.Event()
+    gone.set()
+    for path in ("/calibration/import", "/scan"):
+        assert await asked(served.app, path, gone, method="POST") == 400
+    assert client.get("/scan").json()["scans"] == []
 
 
 SHORT = Deadlines(head_s=0.3, body_s=0.3, idle_s=1, stall_s=0.3)
