@@ -1,5 +1,6 @@
 """Scan bundles: folders with a description, frames, and a calibration, from slrig or from other programs."""
 
+from slrig.bundle.arrays import HoldsObjectsError, read_arrays
 from slrig.bundle.calibration import (
     MAX_CALIBRATION_BYTES,
     check_calibration,
@@ -132,6 +133,7 @@ __all__ = [
     "ExposureFactors",
     "ExposureSeconds",
     "FreeText",
+    "HoldsObjectsError",
     "PoseEntry",
     "Poses",
     "Preset",
@@ -158,6 +160,7 @@ __all__ = [
     "open_bundle",
     "orthonormalise_pose",
     "parse_calibration",
+    "read_arrays",
     "read_bundle",
     "read_calibration",
     "read_capture",

@@ -43,9 +43,12 @@ _NEXT_SCAN, _MAX_SCANS = b"\xff\xda", 64
 """Each scan of a progressive file takes a pass over all pixels; most files have ten."""
 
 TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-MAX_TIFF_PAGES = 65536
-"""The page numbers that bundle.json can hold."""
+MAX_TIFF_PAGES = 4096
+"""Ten times as many as a long sequence at six exposures: each costs time and memory before any is read."""
 MAX_TIFF_TAGS = 256
+_MIN_TIFF_VALUE_BYTES = 2**16
+_TIFF_VALUE_BYTES = np.array([1, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 1, 1, 8, 8, 8])
+"""Of each kind of value, by its number."""
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_GREY, PNG_COLOUR = 0, 2
@@ -80,12 +83,16 @@ TIFF_FAULTS = (
 
 def count_tiff_pages(data: bytes) -> int:
     """Return the number of pages of a TIFF, by following the chain of its directories before any of them is read.
-    Raises ValueError with a description of a chain that leads out of the file, is circular or does not end.
+    Raises ValueError with a description of a chain that leads out of the file, is circular or does not end, or of
+    directories with more values than the file has bytes: many may share one long table, and each is read.
     """
     order = "<" if data.startswith(b"II") else ">"
     is_big = data[2:4] in (b"+\0", b"\0+")
     count_format, tag_bytes, offset_format, first = ("Q", 20, "Q", 8) if is_big else ("H", 12, "I", 4)
+    tag = np.dtype([("code", f"{order}u2"), ("kind", f"{order}u2"), ("count", f"{order}u{8 if is_big else 4}"),
+                    ("value", f"V{8 if is_big else 4}")])  # fmt: skip
     visited: set[int] = set()
+    value_bytes = 0.0
     try:
         (offset,) = struct.unpack_from(order + offset_format, data, first)
         while offset:
@@ -95,9 +102,13 @@ def count_tiff_pages(data: bytes) -> int:
             (tags,) = struct.unpack_from(order + count_format, data, offset)
             if tags > MAX_TIFF_TAGS:
                 raise ValueError(f"{tags} tags on page {len(visited) - 1}")
-            (offset,) = struct.unpack_from(
-                order + offset_format, data, offset + struct.calcsize(order + count_format) + tags * tag_bytes
-            )
+            offset += struct.calcsize(order + count_format)
+            entries = np.frombuffer(data[offset : offset + tags * tag_bytes].ljust(tags * tag_bytes), tag)
+            kinds = np.minimum(entries["kind"], len(_TIFF_VALUE_BYTES) - 1)
+            value_bytes += float(np.dot(entries["count"].astype(np.float64), _TIFF_VALUE_BYTES[kinds]))
+            if value_bytes > 2 * len(data) + _MIN_TIFF_VALUE_BYTES:
+                raise ValueError(f"{value_bytes:.0f} bytes of tags in {len(data)}")
+            (offset,) = struct.unpack_from(order + offset_format, data, offset + tags * tag_bytes)
     except (struct.error, OverflowError) as cause:
         raise ValueError(f"a chain of pages cut after {len(visited)}") from cause
     return len(visited)

@@ -8,7 +8,6 @@ that is 0.06 micrometres, far below any measurement.
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,11 +16,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from slrig.bundle.arrays import read_arrays
 from slrig.bundle.description import CameraName
 from slrig.bundle.storage import json_bytes, write_file
 from slrig.bundle.validation import Strict, read_json, read_json_model, read_text
 from slrig.errors import BundleError
 from slrig.model import CameraTruth, FloatArray, Shot, Surface, Truth
+
+_MAX_TRUTH_BYTES = 2**30
 
 HEALTH_FILE = "health.json"
 HEALTH_MAX_BYTES = 2**20
@@ -213,16 +215,16 @@ def read_truth(folder: Path) -> BundleTruth | None:
         mesh = trimesh.load_mesh(path, process=False)
         surface = Surface(np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int32))
         path = folder / VISIBLE_POINTS_FILE
-        visible = _points(np.load(path, allow_pickle=False))
+        visible = _points(read_arrays(path, _MAX_TRUTH_BYTES)[""])
         cameras = {}
         for path in sorted(folder.glob(TRUTH_MAPS_FILE.format(camera="*"))):
-            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as maps:
-                cameras[path.stem.removeprefix("truth-")] = CameraTruth(
-                    np.asarray(maps["depth_mm"], dtype=np.float64),
-                    np.asarray(maps["projector_px"], dtype=np.float64),
-                    _points(maps["visible_points_mm"]),
-                )
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as cause:
+            maps = read_arrays(path, _MAX_TRUTH_BYTES)
+            cameras[path.stem.removeprefix("truth-")] = CameraTruth(
+                np.asarray(maps["depth_mm"], dtype=np.float64),
+                np.asarray(maps["projector_px"], dtype=np.float64),
+                _points(maps["visible_points_mm"]),
+            )
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as cause:
         message = f"{path}: expected truth of the bundle, found: {cause}; render the scene again"
         raise BundleError(message) from cause
     return BundleTruth(surface, visible, cameras)

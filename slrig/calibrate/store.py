@@ -15,7 +15,6 @@ import json
 import shutil
 import threading
 import uuid
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
@@ -29,7 +28,7 @@ import structlog
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
-from slrig.bundle import read_calibration, sync_folder, sync_tree, write_durably, write_file
+from slrig.bundle import read_arrays, read_calibration, sync_folder, sync_tree, write_durably, write_file
 from slrig.calibration import (
     PROJECTOR,
     Board,
@@ -542,11 +541,13 @@ def reading_bytes(pose: ReadPose) -> bytes:
     return buffer.getvalue()
 
 
+_MAX_READING_BYTES = 2**28
+
+
 def _read_reading(path: Path) -> ReadPose:
     fields: dict[str, dict[str, dict[str, Any]]] = {part: {} for part in _READ_PARTS}
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = dict(archive)
+        arrays = read_arrays(path, _MAX_READING_BYTES)
         name = str(arrays.pop("name"))
         for key, array in arrays.items():
             part, camera, field = key.split("/")
@@ -554,7 +555,7 @@ def _read_reading(path: Path) -> ReadPose:
         views, light, figures = (
             {camera: kind(**values) for camera, values in fields[part].items()} for part, kind in _READ_PARTS.items()
         )
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         message = f"{path} cannot be read ({error}). Drop that pose (DELETE …/pose/N) and shoot it again."
         raise StorageError(message) from error
     return ReadPose(PoseObservation(name, views, light), figures)

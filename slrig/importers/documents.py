@@ -5,11 +5,9 @@ Strangers write these files: sizes are checked before anything is unpacked, and 
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import struct
-import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -18,14 +16,22 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
-from slrig.bundle import MAX_CALIBRATION_BYTES, MAX_STORAGE_BYTES, natural_sort_key, read_file_storage, read_text
+from slrig.bundle import (
+    MAX_CALIBRATION_BYTES,
+    MAX_STORAGE_BYTES,
+    HoldsObjectsError,
+    natural_sort_key,
+    read_arrays,
+    read_file_storage,
+    read_text,
+)
 from slrig.disk import storage_errors
 from slrig.errors import CalibrationError
 from slrig.model import FloatArray
 
 MAX_YAML_BYTES = 2**18
 MAX_YAML_DEPTH = 12
-MAX_BINARY_BYTES = 2**26
+MAX_BINARY_BYTES = 2**25
 """Of NumPy's and MATLAB's files, packed and unpacked."""
 MAX_NUMBERS = 2**16
 _MAX_DEPTH = 16
@@ -97,7 +103,7 @@ def _read_file(path: Path) -> Any:
         raise CalibrationError(f"{path}: expected numbers, found {_HDF5}")
     if data.startswith((b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")):
         raise CalibrationError(f"{path}: expected numbers, found {_PICKLE}")
-    readers = {b"PK\x03\x04": _read_npz, b"\x93NUMPY": _read_npy, b"MATLAB 5.0": _read_mat}
+    readers = {b"PK\x03\x04": _read_npz, b"\x93NUMPY": _read_npz, b"MATLAB 5.0": _read_mat}
     reader = next((each for head, each in readers.items() if data.startswith(head)), None)
     if reader is not None:
         try:
@@ -200,30 +206,12 @@ def _require_single_keys(node: Any, path: Path) -> None:
             _require_single_keys(each, path)
 
 
-def _read_npy(data: bytes, path: Path) -> Any:
+def _read_npz(_data: bytes, path: Path) -> Any:
     try:
-        return np.load(io.BytesIO(data), allow_pickle=False)
-    except ValueError as cause:
-        if "pickle" in str(cause):
-            raise CalibrationError(f"{path}: expected an array, found {_PICKLE}") from cause
-        raise
-
-
-def _read_npz(data: bytes, path: Path) -> dict[str, Any]:
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        if sum(each.file_size for each in archive.infolist()) > MAX_BINARY_BYTES:
-            raise CalibrationError(f"{path}: expected at most {MAX_BINARY_BYTES} bytes of arrays, found more; {_ALONE}")
-        found: dict[str, Any] = {}
-        pickled = 0
-        for each in archive.infolist():
-            if each.filename.endswith(".npy"):
-                try:
-                    found[each.filename.removesuffix(".npy")] = _read_npy(archive.read(each), path)
-                except CalibrationError:
-                    pickled += 1
-    if pickled and not found:
-        raise CalibrationError(f"{path}: expected arrays, found {_PICKLE}")
-    return found
+        arrays = read_arrays(path, MAX_BINARY_BYTES)
+    except HoldsObjectsError as cause:
+        raise CalibrationError(f"{path}: expected arrays, found {_PICKLE}") from cause
+    return arrays.get("", arrays)
 
 
 _MAT_KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle import natural_sort_key
+from slrig.bundle import natural_sort_key, read_arrays
 from slrig.errors import BundleError
 
 STACKS = {".npy", ".npz"}
@@ -19,9 +17,6 @@ MAX_ARRAY_BYTES = 2**32
 
 _WORD = 65535
 _MIN_SIDE_PX = 16  # of images; smaller arrays are matrices
-_FAULTS = (
-    OSError, ValueError, EOFError, LookupError, SyntaxError, TypeError, RuntimeError, zipfile.BadZipFile, zlib.error
-)  # fmt: skip
 
 
 class ArrayImages(NamedTuple):
@@ -45,10 +40,8 @@ def read_stack(path: Path) -> ArrayImages:
     Raises BundleError: the file is damaged, or has no images.
     """
     try:
-        with path.open("rb") as stream:
-            is_archive = stream.read(4) == b"PK\3\4"
-        arrays = _load_archive(path) if is_archive else {"": np.load(path, mmap_mode="r", allow_pickle=False)}
-    except _FAULTS as cause:
+        arrays = read_arrays(path, MAX_ARRAY_BYTES)
+    except (OSError, ValueError) as cause:
         message = f"{path}: expected arrays of numbers as np.save or np.savez write them, found {cause}; save it again"
         raise BundleError(message) from cause
     images: dict[str, NDArray[Any]] = {}
@@ -68,23 +61,6 @@ def read_stack(path: Path) -> ArrayImages:
     samples, is_stretched = _as_samples(path, list(images.values()))
     summary = f"{path.name}: no images, ignored: {', '.join(others)}" if others else ""
     return ArrayImages(dict(zip(images, samples, strict=True)), is_stretched, summary)
-
-
-def _load_archive(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an .npz file, whose headers are compared with their sizes before memory is taken."""
-    total_bytes = 0
-    with zipfile.ZipFile(path) as archive:
-        for entry in archive.infolist():
-            with archive.open(entry) as stream:
-                is_first = np.lib.format.read_magic(stream) == (1, 0)
-                read = np.lib.format.read_array_header_1_0 if is_first else np.lib.format.read_array_header_2_0
-                shape, _, dtype = read(stream)
-            size_bytes = float(np.prod(shape, dtype=np.float64)) * dtype.itemsize
-            total_bytes += entry.file_size
-            if size_bytes > entry.file_size or total_bytes > MAX_ARRAY_BYTES:
-                raise ValueError(f"{entry.filename} of {size_bytes:.0f} bytes")
-    with np.load(path, allow_pickle=False) as arrays:
-        return {key: arrays[key] for key in arrays.files}
 
 
 def _split(array: NDArray[Any]) -> list[NDArray[Any]]:
