@@ -13,9 +13,7 @@ files, and loads neither the driver nor its vendor's library.
 from __future__ import annotations
 
 import importlib.metadata
-import math
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -187,35 +185,24 @@ def _found_by(entry: importlib.metadata.EntryPoint) -> tuple[FoundDevice, ...]:
     return result
 
 
-_FRESH_S = 5.0
-"""How old the result of a search for devices may be."""
-
-
 class DeviceSearch:
     """The search for devices, which touches hardware. Whoever calls sees to it that one is made at a time."""
 
-    def __init__(self, *, now_s: Callable[[], float] = time.monotonic) -> None:
-        self._now_s = now_s
+    def __init__(self) -> None:
         self._found: DiscoveredDevices | None = None
-        self._found_s = -math.inf
 
     def found(self, holder: str | None) -> DiscoveredDevices:
-        """What is plugged in, some seconds old at most. holder : who holds the rig; the last result stands meanwhile.
+        """What is plugged in. holder : who holds the rig; the last result stands meanwhile.
 
         Raises RigBusyError: the rig is held, and no search was made before.
         """
-        if holder is not None:
-            if self._found is None:
-                message = (
-                    f"The rig is held by {holder}, and a search for devices would disturb it. Ask again when that "
-                    "is over."
-                )
-                raise RigBusyError(message, holder=holder, since="")
-            return self._found
-        asked_s = self._now_s()
-        if self._found is None or asked_s - self._found_s > _FRESH_S:
+        if holder is None:
             self._found = discover_devices()
-            self._found_s = asked_s
+        if self._found is None:
+            message = (
+                f"The rig is held by {holder}, and a search for devices would disturb it. Ask again when that is over."
+            )
+            raise RigBusyError(message, holder=holder or "", since="")
         return self._found
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import math
 import re
 import secrets
 import time
@@ -389,6 +390,11 @@ _JSON_TYPES = frozenset({"application/json", "application/problem+json"})
 _BURST_S = 4.0
 """How many seconds' worth of requests may come at once: a page with its pictures."""
 _MOST_COUNTED = 1024
+_TOLD_EVERY_S = 60.0
+"""How often it is put on record that a key sends too many requests: each of them would fill the record."""
+_MOST_HELD = 128
+_HELD_S = 1.0
+"""How long a request that is one too many waits for its refusal: whoever sends the next one at once sends few."""
 _LOOK_AGAIN_S = 5.0
 """How long a stream may go on that was begun with a key that has been revoked, or has expired, since then."""
 
@@ -428,6 +434,7 @@ class Access:
         self._sessions = sessions
         self._audit = audit
         self._rates = Rates(per_second)
+        self._held = Shares("refused requests", _MOST_HELD, "Wait.")
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request, or refuse it."""
@@ -449,6 +456,9 @@ class Access:
                 # Behind a proxy all strangers have one address, and a monitor takes 429 for the service's end.
                 self._rates.count(address, address)
         except Refused as refusal:
+            if caller is not None and refusal.status == 429:
+                with suppress(HTTPException), acting_as(caller.name), self._held.take():
+                    await asyncio.sleep(_HELD_S)
             await self._refuse(refusal, address, caller, method, path, scope, receive, send)
             return
         scope.setdefault("state", {})["caller"] = caller
@@ -531,7 +541,7 @@ class Access:
                 self._rates.count(address, address)
             except Refused as too_many:
                 refusal = too_many
-        elif caller is not None:
+        elif caller is not None and refusal.noted:
             await self._note(caller.name, address, method, path, refusal.status, "")
         response = answer(problem(refusal.status, refusal.code, str(refusal)), headers=refusal.headers)
         await response(scope, receive, send)
@@ -547,9 +557,11 @@ class Access:
 class Refused(Exception):  # noqa: N818 - an answer, not a fault of ours
     """A request that goes no further."""
 
-    def __init__(self, status: int, code: str, detail: str, headers: dict[str, str] | None = None) -> None:
+    def __init__(
+        self, status: int, code: str, detail: str, headers: dict[str, str] | None = None, *, noted: bool = True
+    ) -> None:
         super().__init__(detail)
-        self.status, self.code, self.headers = status, code, headers
+        self.status, self.code, self.headers, self.noted = status, code, headers, noted
 
 
 def refuse_foreign_page(headers: Headers, method: str, path: str, *, by_cookie: bool) -> None:
@@ -645,21 +657,21 @@ class Rates:
     def __init__(self, per_second: float, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._per_second = per_second
         self._clock = clock
-        self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        self._left: OrderedDict[str, tuple[float, float, float]] = OrderedDict()
 
     def count(self, sender: str, name: str) -> None:
         """Count one request of a sender, called so in the refusal. Raises Refused: it is one too many."""
         now = self._clock()
         most = max(self._per_second * _BURST_S, 1.0)
-        left, since = self._left.pop(sender, (most, now))
+        left, since, told = self._left.pop(sender, (most, now, -math.inf))
         left = min(left + (now - since) * self._per_second, most)
-        allowed = left >= 1.0
-        self._left[sender] = (left - 1.0 if allowed else left, now)
+        allowed, tell = left >= 1.0, now >= told + _TOLD_EVERY_S
+        self._left[sender] = (left - 1.0, now, told) if allowed else (left, now, now if tell else told)
         if len(self._left) > _MOST_COUNTED:
             self._left.popitem(last=False)
         if not allowed:
             detail = f"'{name}' sends more than {self._per_second:g} requests a second. Wait a second, then send fewer."
-            raise Refused(429, "too-many-requests", detail, {"Retry-After": "1"})
+            raise Refused(429, "too-many-requests", detail, {"Retry-After": "1"}, noted=tell)
 
 
 LOCAL_NAMES = ("localhost", "127.0.0.1", "[::1]")

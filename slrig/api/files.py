@@ -243,10 +243,13 @@ def kept_file(path: Path, media_type: str, job_id: UUID, known: str | None) -> R
     )
 
 
+class _File(FileResponse):
+    chunk_size = 2**19
+    """Bytes: each piece takes a thread and the loop, and a mesh has megabytes."""
+
+
 def _kept(path: Path, media_type: str, headers: dict[str, str]) -> Response:
-    return FileResponse(
-        path, media_type=media_type, filename=path.name, content_disposition_type="inline", headers=headers
-    )
+    return _File(path, media_type=media_type, filename=path.name, content_disposition_type="inline", headers=headers)
 
 
 def _cloud(service: Service, scan_id: UUID, form: str, camera: str | None, known: str | None) -> Response:

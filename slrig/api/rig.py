@@ -73,6 +73,9 @@ _RED, _BLUE = (32, 32, 224), (224, 80, 32)
 _LOOK_S = 0.5
 """How long one look for a picture holds a thread; then the client is asked whether it is still there."""
 
+_FRESH_S = 5.0
+"""How old the result of a search for devices may be."""
+
 router = APIRouter(tags=["rig"])
 
 _STREAM: dict[int | str, dict[str, Any]] = {
@@ -122,7 +125,7 @@ async def list_devices(service: Serving) -> DeviceList:
     """Return the drivers that are installed, the devices that are plugged in, and the libraries that are missing. While
     the rig is held, those that were plugged in before.
     """
-    return await service.probes.of("devices", partial(_devices, service))
+    return await service.probes.of("devices", partial(_devices, service), fresh_s=_FRESH_S)
 
 
 def _devices(service: Service) -> DeviceList:

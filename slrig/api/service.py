@@ -200,8 +200,8 @@ class Service:
         again, makings = "Ask again.", "places for what is made on request"
         self.makings = Makings(Shares(makings, MOST_MAKINGS, again, status=503))
         self.clouds = Makings(Shares(f"{makings} by the worker", MOST_MAKINGS, again, status=503))
-        # Two of them, each made once for all: nobody is refused.
-        self.probes = Makings(Shares("probes and searches for devices", 2, again, status=503, at_once=2))
+        # There are three, each made once for all: nobody is refused.
+        self.probes = Makings(Shares("probes", 6, again, status=503, at_once=3))
         self._lasting: frozenset[str] = frozenset()
         database, outbox = self.store.database, self.store.outbox
         self.senders = senders_of(settings, outbox)

@@ -72,7 +72,7 @@ class Makings:
         self._makings: dict[Hashable, asyncio.Future[Any]] = {}
 
     async def of(self, what: Hashable, make: Callable[[], _Made], *, fresh_s: float = 0.0) -> _Made:
-        """What `make` returns, or another call of it for the same, under way or so fresh.
+        """What `make` returns, or another call of it for the same, which is under way or ended well just before.
 
         Raises what that raises, and HTTPException: there is no place to make it.
         """
@@ -83,8 +83,11 @@ class Makings:
         return made
 
     async def _make(self, what: Hashable, make: Callable[[], _Made], fresh_s: float) -> _Made:
+        kept_s = 0.0
         try:
             async with self.shares.turn():
-                return await run_in_threadpool(make)
+                made = await run_in_threadpool(make)
+            kept_s = fresh_s
+            return made
         finally:
-            asyncio.get_running_loop().call_later(fresh_s, self._makings.pop, what)
+            asyncio.get_running_loop().call_later(kept_s, self._makings.pop, what)

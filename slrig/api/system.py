@@ -36,7 +36,7 @@ from slrig.jobs.store import AuditEntry
 from slrig.schedule.store import RunState, TaskKind
 
 _FRESH_S = 1.0
-"""For how long a probe is told what was found for the one before: everybody may ask, as often as they like."""
+"""For how long probes and figures are those of the one who asked before: everybody may, as often as they like."""
 
 router = APIRouter(tags=["system"])
 
@@ -46,15 +46,19 @@ router = APIRouter(tags=["system"])
     response_class=Response,
     responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}, "description": "the figures"}},
 )
-def read_metrics(service: Serving) -> Response:
+async def read_metrics(service: Serving) -> Response:
     """Return the service's figures in the text format of Prometheus: scans and scheduled runs by state, whether the rig
     is held, the calibration's age and expected error, the rig's health, and when each schedule is due next; and, since
     the start of this process, how long answers, jobs and their stages took.
     """
+    text = await service.probes.of("metrics", partial(_figures, service), fresh_s=_FRESH_S)
+    return Response(text, media_type=CONTENT_TYPE_PLAIN_0_0_4)
+
+
+def _figures(service: Service) -> bytes:
     registry = CollectorRegistry()
     registry.register(_Figures(service))
-    text = generate_latest(registry) + generate_latest(service.durations.registry)
-    return Response(text, media_type=CONTENT_TYPE_PLAIN_0_0_4)
+    return generate_latest(registry) + generate_latest(service.durations.registry)
 
 
 class _Figures(Collector):
@@ -224,8 +228,8 @@ class AuditPage(BaseModel):
 
 @router.get("/audit")
 def list_audit(service: Serving, response: Response, cursor: Cursor = None, limit: PageLength = 50) -> AuditPage:
-    """List who did what, from new to old: every request that writes, and every one that was refused for its key's scope
-    or number. Names are those of keys.
+    """List who did what, from new to old: every request that writes or was refused for its key's scope, and once a
+    minute that a key sends too many. Names are those of keys.
     """
     shown, following = paged(
         lambda most: service.audit.page(before=cursor, limit=most), limit, "/audit", service, response

@@ -427,23 +427,12 @@ def test_a_finder_that_hangs_is_left_behind_until_it_returns(
     assert discover_devices().faults == ()
 
 
-def test_devices_are_searched_once_for_all_who_ask_and_never_beside_a_job(monkeypatch: pytest.MonkeyPatch) -> None:
-    now_s, searches = [100.0], list[float]()
-    nothing = DiscoveredDevices((), (), ())
-
-    def search() -> DiscoveredDevices:
-        searches.append(now_s[0])
-        return nothing
-
-    monkeypatch.setattr(discovery, "discover_devices", search)
-    devices = DeviceSearch(now_s=lambda: now_s[0])
+def test_devices_are_never_searched_beside_a_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [DiscoveredDevices((), (), ()), DiscoveredDevices((), (), ())]
+    left = list(found)
+    monkeypatch.setattr(discovery, "discover_devices", lambda: left.pop(0))
+    devices = DeviceSearch()
     with pytest.raises(RigBusyError, match="held by scan 7"):
         devices.found("scan 7")
-    assert searches == []
-    for _ in range(3):
-        assert devices.found(None) is nothing
-    now_s[0] += 6.0
-    assert devices.found("scan 7") is nothing
-    assert searches == [100.0]
-    devices.found(None)
-    assert searches == [100.0, 106.0]
+    assert (devices.found(None), devices.found("scan 7"), left) == (found[0], found[0], found[1:])
+    assert devices.found(None) is found[1]

@@ -12,7 +12,8 @@ import pytest
 from fastapi import APIRouter, FastAPI
 from fastapi.testclient import TestClient
 
-from slrig.api import system
+from slrig.api import auth, system
+from slrig.api import rig as rig_routes
 from slrig.api.app import create_app
 from slrig.api.auth import KeyRing
 from slrig.api.problems import install_problems
@@ -63,7 +64,9 @@ class ServedBench(TameBench):
         }
         for each in (self.captures(), self.tame.patched(), stand_ins(functions)):
             patched.enter_context(each)
-        patched.enter_context(pytest.MonkeyPatch.context()).setattr(system, "_FRESH_S", 0.0)
+        waits = patched.enter_context(pytest.MonkeyPatch.context())
+        for module, name in ((system, "_FRESH_S"), (rig_routes, "_FRESH_S"), (auth, "_HELD_S")):
+            waits.setattr(module, name, 0.0)
         self.unpatch = patched.close
         rig = RigSession("bench", self.open_rig)
         manager = JobManager(store, folder, rig, self.worker, *KINDS, queue_length=1)

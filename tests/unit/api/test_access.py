@@ -40,6 +40,8 @@ from slrig.config import ServiceSettings
 from slrig.errors import ConfigError, StorageError
 from slrig.failure import errors_by_code
 from tests.unit.api.conftest import HERE, KEY, ServedBench, client_of, ended, refusal
+from tests.unit.looped import on_loop
+from tests.unit.scan.fakes import WAIT_S
 
 OPENAPI = Path(__file__).resolve().parents[3] / "config" / "openapi.json"
 PATHS = json.loads(OPENAPI.read_text(encoding="utf-8"))["paths"]
@@ -378,9 +380,11 @@ def test_a_stream_ends_with_the_key_that_began_it_and_needs_nothing_to_send(
         # Who has it now may not go on with it.
         ring.add("Ann", [])
         try:
-            await asyncio.Event().wait()
-        finally:
+            async with asyncio.timeout(WAIT_S):
+                await asyncio.Event().wait()
+        except asyncio.CancelledError:
             ended.append(True)
+            raise
 
     async def app(scope: ASGIScope, receive: Receive, send: Send) -> None:
         await answer(silent())(scope, receive, send)
@@ -567,8 +571,10 @@ def test_too_many_requests_of_one_name_wait(
     app = create_app(served.service, ring=ring)
     ann = TestClient(app, base_url=HERE, headers={"X-API-Key": ring.add("Ann", [])})
     bob = TestClient(app, base_url=HERE, headers={"X-API-Key": ring.add("Bob", [])})
-    statuses = [ann.get("/session").status_code for _ in range(8)]
-    assert (statuses[0], statuses[-1]) == (200, 429)
+    statuses = [ann.get("/session").status_code for _ in range(12)]
+    assert (statuses[0], statuses[-2:]) == (200, [429, 429])
+    # It is put on record, and does not fill that.
+    assert [each.status for each in served.service.audit.page(before=None, limit=3) if each.who == "Ann"] == [429]
     assert ann.get("/session").headers["Retry-After"] == "1"
     assert bob.get("/session").status_code == 200
     unknown = [TestClient(app, base_url=HERE).get("/scan").status_code for _ in range(8)]
@@ -576,6 +582,36 @@ def test_too_many_requests_of_one_name_wait(
     # Behind a proxy a monitor has the address of all strangers.
     probes = [TestClient(app, base_url=HERE).get(path).status_code for path in ("/livez", "/readyz", "/")]
     assert probes == [200, 200, 429]
+
+
+@on_loop
+async def test_request_too_many_waits_for_its_refusal_where_few_do(
+    served: ServedBench, ring: KeyRing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(access, "_HELD_S", 3600.0)
+    monkeypatch.setattr(access, "_MOST_HELD", 2)
+    guarded = Access(broken, ring=ring, sessions=sessions(served), audit=served.service.audit, per_second=1e-9)
+    headers = [(b"x-api-key", ring.add("Ann", []).encode())]
+    scope = {"type": "http", "method": "GET", "path": "/scan", "headers": headers, "client": ("127.0.0.1", 1)}
+    sent = list[Any]()
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    async def nothing() -> Any:
+        return {"type": "http.disconnect"}
+
+    with pytest.raises(ZeroDivisionError):
+        await guarded(scope, nothing, send)
+    sent.clear()
+    waiting = asyncio.ensure_future(guarded(scope, nothing, send))
+    while not guarded._held.taken:
+        await asyncio.to_thread(int)
+    await guarded(scope, nothing, send)
+    assert (sent[0]["status"], waiting.done()) == (429, False)
+    waiting.cancel()
+    await asyncio.wait([waiting])
+    assert not guarded._held.taken
 
 
 def test_rates_come_back_with_time_and_forget_the_oldest(monkeypatch: pytest.MonkeyPatch) -> None:

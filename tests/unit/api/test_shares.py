@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, asynccontextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,6 +17,7 @@ from starlette.exceptions import HTTPException
 from slrig.api import files
 from slrig.api.auth import KeyRing
 from slrig.api.scopes import KeyScope
+from slrig.api.service import turn
 from slrig.api.shares import Makings, Shares
 from slrig.errors import QueueFullError
 from slrig.jobs.records import ANYONE, acting_as, require_share
@@ -173,12 +175,13 @@ def test_a_key_whose_conversions_hang_holds_up_nothing_else(
             assert slow.began.acquire(timeout=WAIT_S)
             while served.service.makings.shares.taken["Look"] < 4:
                 threading.Event().wait(0.001)
+            assert served.service.requests.taken["Look"] == 6
             # One of hers is made, the others wait; a further one is refused at once.
             assert client.get(places[0][names[4]], headers=headers).json()["type"] == "/problems/service-unavailable"
             assert not slow.began.acquire(blocking=False)
             mine = pool.submit(client.get, places[1]["mesh.stl"])
             assert slow.began.acquire(timeout=WAIT_S), "somebody else's conversion waits for hers"
-            assert [client.get(path).status_code for path in ("/livez", "/readyz", "/device")] == [200, 200, 200]
+            assert [client.get(path).status_code for path in ("/livez", "/readyz")] == [200, 200]
             scan = served.held(client)
             assert client.post(scan["links"]["cancel"]).status_code == 202
         finally:
@@ -189,26 +192,22 @@ def test_a_key_whose_conversions_hang_holds_up_nothing_else(
 
 
 @on_loop
-async def test_cancel_needs_no_turn(client: TestClient, served: ServedBench) -> None:
-    scan = await asyncio.to_thread(served.held, client)
-    requests, gate = served.service.requests, asyncio.Event()
+async def test_cancel_and_what_needs_no_key_need_no_turn() -> None:
+    state = SimpleNamespace(service=SimpleNamespace(requests=Shares("places", 1, "Wait.")))
 
-    async def waiting() -> AsyncIterator[None]:
-        with acting_as("environment"):
-            async with requests.turn():
-                yield
-                await gate.wait()
+    async def answered(path: str, caller: str | None) -> int:
+        request: Any = SimpleNamespace(
+            app=SimpleNamespace(state=state), state=SimpleNamespace(caller=caller), url=SimpleNamespace(path=path)
+        )
+        try:
+            async with asynccontextmanager(turn)(request):
+                return 200
+        except HTTPException as refused:
+            return refused.status_code
 
-    held = [waiting() for _ in range(8)]
-    for each in held:
-        await anext(each)
-    assert requests.taken["environment"] == 8
-    cancelled = await asyncio.to_thread(client.post, scan["links"]["cancel"])
-    assert cancelled.status_code == 202
-    gate.set()
-    for each in held:
-        await anext(each, None)
-    assert not requests.taken
+    with acting_as("ann"), state.service.requests.take():
+        assert await answered("/scan", "ann") == 429
+        assert [await answered("/scan/1/cancel", "ann"), await answered("/livez", None)] == [200, 200]
 
 
 def test_scans_of_one_key_leave_a_place_in_the_line(
