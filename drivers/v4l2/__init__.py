@@ -60,7 +60,12 @@ def find_devices() -> tuple[FoundDevice, ...]:
     from drivers.v4l2.finding import list_nodes
 
     return tuple(
-        FoundDevice("v4l2", node.name, f"{node.card} ({node.path}){f', {node.note}' if node.note else ''}")
+        FoundDevice(
+            "v4l2",
+            node.name,
+            f"{node.card} ({node.path}){f', {node.note}' if node.note else ''}",
+            {} if node.focus is None else {"focus": node.focus},
+        )
         for node in list_nodes()
     )
 

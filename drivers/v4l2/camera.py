@@ -19,13 +19,16 @@ from drivers.v4l2.controls import (
     get_control,
     list_controls,
     ordered_settings,
+    require_focus,
     set_control,
+    set_exposure,
     switch_off_processing,
 )
 from drivers.v4l2.finding import CameraNode, NodeIdentity, query_identity, resolve_node
 from drivers.v4l2.formats import CorruptFrameError, PixelLayout, colour_image, grey_image
 from drivers.v4l2.options import V4L2Options
 from drivers.v4l2.stream import (
+    PERIOD_TOLERANCE,
     ExposureInterval,
     FilledBuffer,
     FrameCounter,
@@ -34,16 +37,17 @@ from drivers.v4l2.stream import (
     Waker,
     exposure_interval,
     negotiate_format,
+    set_period,
 )
 from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.errors import FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame, Pixels
 
-_PERIOD_TOLERANCE = 0.02
-"""Part of the frame period by which an exposure may exceed it."""
+_START_TOLERANCE_S = 10.0
+"""Time allowed for the first frame beyond its usual one: some webcams take 2 to 4 s (OpenCV waits 10 s)."""
 
-_START_TOLERANCE_S = 2.0
-"""Time allowed for the first frames beyond their usual one."""
+_SETTLE_TOLERANCE_S = 2.0
+"""Time allowed for the frames after it beyond their usual one."""
 
 
 @dataclass(slots=True)
@@ -96,7 +100,7 @@ class V4L2Camera:
             self._format = negotiate_format(self._handle, node.path, options)
             self._stream = V4L2Stream(self._handle, node.path, options.buffers, self._waker)
             self._resources.callback(self._stream.release)
-            self._period_ns = self._format.period_ns
+            self._frame_ns = self._period_ns = self._format.period_ns
             try:
                 self._controls = exclude_controls(list_controls(self._handle), options.skip_controls, node.path)
                 width_px = self._format.size.width_px
@@ -104,15 +108,17 @@ class V4L2Camera:
             except OSError as error:
                 raise kernel.device_error(node.path, "listing its controls", error) from error
             self._scale = GainScale(gain_control(self._controls), options.gain_unity)
+            require_focus(self._handle, node.path, self._controls, options)
             processed = switch_off_processing(
                 self._handle, node.path, self._controls, named=options.controls, is_uvc=identity.is_uvc
             )
-            self._set_controls(None, None)
+            self._units: tuple[int | None, int | None] = (None, None)
+            refused = self._set_controls()
             self._applied = self._read_back()
         except BaseException:
             self._resources.close()
             raise
-        self._info = self._describe(identity, node, (*self._format.notes, *processed))
+        self._info = self._describe(identity, node, (*self._format.notes, *processed, *refused))
 
     @property
     def info(self) -> CameraInfo:
@@ -126,17 +132,23 @@ class V4L2Camera:
 
     @property
     def period_ns(self) -> int:
-        """Frame period: as negotiated, and once armed, as measured where that is longer."""
+        """Frame period: as set for the exposure, and once armed, as measured where that is longer."""
         return self._period_ns
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        """See `Camera`. Rounds exposure and gain to the device's steps and reads every control back."""
+        """See `Camera`. Rounds exposure and gain to what the device takes, and reads every control back. Where the user
+        names no frame rate, that is lowered for an exposure that is longer than a frame.
+        """
         with self._lock:
             self._state.check_settings(settings, self._info)
             units = None
             if self._exposure is not None:
                 units = self._exposure.units(settings.exposure_s)
-            self._set_controls(units, self._scale.units(settings.gain))
+                wanted_ns = self._format.period_for(settings.exposure_s)
+                if wanted_ns != self._frame_ns:
+                    self._frame_ns = self._period_ns = set_period(self._handle, self._node, wanted_ns)
+            self._units = units, self._scale.units(settings.gain)
+            self._set_controls()
             self._applied = self._read_back()
             return self._applied
 
@@ -266,8 +278,8 @@ class V4L2Camera:
     def _settle(self) -> None:
         """Skip the first frames, which may be exposed with earlier settings, and measure the frame period."""
         settling = self._options.settle_frames
-        slowest_ns = max(self._format.period_ns, round(self._applied.exposure_s * 1e9))
-        until_ns = time.monotonic_ns() + 4 * settling * slowest_ns + round(_START_TOLERANCE_S * 1e9)
+        slowest_ns = max(self._frame_ns, round(self._applied.exposure_s * 1e9))
+        until_ns = time.monotonic_ns() + 4 * slowest_ns + round(_START_TOLERANCE_S * 1e9)
         skipped = _SkippedFrames()
         came = 0
         while came < settling + 1:
@@ -278,12 +290,16 @@ class V4L2Camera:
                     f"in time; skipped: {skipped}. Check cable and bandwidth (dmesg | tail)"
                 )
                 raise FrameTimeoutError(message)
-            if self._counter.is_new(buffer):
-                came += 1
-            else:
+            if not self._counter.is_new(buffer):
                 skipped.repeated += 1
+            elif (came := came + 1) == 1:
+                # Some cameras forget exposure, gain and focus when the stream starts, and the driver answers for them
+                # from its memory. Some drivers lock controls meanwhile.
+                with suppress(UnsupportedByDeviceError):
+                    self._set_controls()
+                until_ns = time.monotonic_ns() + 4 * settling * slowest_ns + round(_SETTLE_TOLERANCE_S * 1e9)
             self._stream.requeue(buffer)
-        self._period_ns = max(self._format.period_ns, self._counter.period_ns() or 0)
+        self._period_ns = max(self._frame_ns, self._counter.period_ns() or 0)
         self._require_unchanged()
 
     def _require_unchanged(self) -> None:
@@ -297,7 +313,7 @@ class V4L2Camera:
             )
             raise UnsupportedByDeviceError(message)
         period_s = self._period_ns / 1e9
-        if self._applied.exposure_s > period_s * (1 + _PERIOD_TOLERANCE) and self._exposure is not None:
+        if self._applied.exposure_s > period_s * (1 + PERIOD_TOLERANCE) and self._exposure is not None:
             message = (
                 f"camera '{self._name}': requested an exposure of {self._applied.exposure_s:.6g} s, and its frames "
                 f"come every {period_s:.6g} s, which is shorter; request a shorter exposure_s, or a "
@@ -305,14 +321,24 @@ class V4L2Camera:
             )
             raise UnsupportedByDeviceError(message)
 
-    def _set_controls(self, exposure_units: int | None, gain_units: int | None) -> None:
-        for control, value in ordered_settings(
-            self._controls, self._options, exposure_units=exposure_units, gain_units=gain_units, node=self._node
+    def _set_controls(self) -> list[str]:
+        """Set every control; return notes on those that the device refuses and that nobody needs."""
+        exposure, gain = self._units
+        notes = []
+        for step in ordered_settings(
+            self._controls, self._options, exposure_units=exposure, gain_units=gain, node=self._node
         ):
-            set_control(self._handle, self._node, control, value)
+            is_exposure = self._exposure is not None and step.control is self._exposure.control
+            try:
+                (set_exposure if is_exposure else set_control)(self._handle, self._node, step.control, step.value)
+            except UnsupportedByDeviceError as refusal:
+                if step.needed:
+                    raise
+                notes.append(f"an automatic of its own stays as it is: {refusal}")
+        return notes
 
     def _read_back(self) -> AppliedSettings:
-        exposure_s = self._format.period_ns / 1e9
+        exposure_s = self._frame_ns / 1e9
         if self._exposure is not None:
             exposure_s = get_control(self._handle, self._node, self._exposure.control) * self._exposure.unit_s
         gain = 1.0
@@ -339,7 +365,14 @@ class V4L2Camera:
 
     def _describe(self, identity: NodeIdentity, node: CameraNode, notes: tuple[str, ...]) -> CameraInfo:
         period_s = self._format.period_ns / 1e9
-        exposures = (period_s, period_s) if self._exposure is None else self._exposure.range_s
+        exposures = (period_s, period_s)
+        if self._exposure is not None:
+            # Longer ones do not fit into a frame, whatever the control accepts.
+            shortest_s, longest_s = self._exposure.range_s
+            exposures = (
+                shortest_s,
+                max(min(longest_s, max(self._format.slower_ns, default=0) / 1e9 or period_s), shortest_s),
+            )
         return CameraInfo(
             name=self._name,
             model=identity.card,

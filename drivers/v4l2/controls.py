@@ -1,5 +1,9 @@
 """Controls of a device: setting and reading back, image processing to switch off, and units of exposure and gain.
 
+What a device declares is a bound: some take only certain exposures between the ends of their range (see
+`set_exposure`), and refuse controls that they list. Only exposure and gain are worth an error; what else cannot be set,
+and was not named by the user, is noted.
+
 Order matters: a device refuses or forgets an exposure while automatic exposure is on.
 
 A device that answers one control with a fault is still connected. uvcvideo (`uvc_query_ctrl`) passes on a fault of the
@@ -20,6 +24,7 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import math
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -33,7 +38,9 @@ from slrig.errors import UnsupportedByDeviceError
 
 _USER, _CAMERA, _SOURCE, _PROCESSING = 0x0098_0900, 0x009A_0900, 0x009E_0900, 0x009F_0900
 
+BRIGHTNESS = _USER + 0
 CONTRAST = _USER + 1
+SATURATION = _USER + 2
 AUTO_WHITE_BALANCE = _USER + 12
 GAMMA = _USER + 16
 EXPOSURE_LINES = _USER + 17
@@ -68,7 +75,8 @@ _MAX_CLASS_LENGTH = 64
 _MANUAL = 1
 _OFF = 0
 _LINEAR_GAMMA = 100
-_KEEP_DEFAULT = (CONTRAST, ZOOM_ABSOLUTE, PAN_ABSOLUTE, TILT_ABSOLUTE)
+_KEEP_DEFAULT = (BRIGHTNESS, CONTRAST, SATURATION, ZOOM_ABSOLUTE, PAN_ABSOLUTE, TILT_ABSOLUTE)
+_HALVES = (*(round(1e4 / 2**power) for power in range(11, -1, -1)), 20_000)
 _SWITCHES = (
     *(AUTOBRIGHTNESS, EXPOSURE_AUTO_PRIORITY, HDR_SENSOR_MODE, IMAGE_STABILIZATION, ISO_SENSITIVITY_AUTO),
     *(PRESET_WHITE_BALANCE, SCENE_MODE, WIDE_DYNAMIC_RANGE),
@@ -215,15 +223,32 @@ def set_control(handle: int, node: Path, control: Control, value: int) -> None:
         raise UnsupportedByDeviceError(message)
 
 
+def set_exposure(handle: int, node: Path, control: Control, units: int) -> None:
+    """Set an exposure, or the one next to it that the device takes. Raises as `set_control`.
+
+    Some webcams declare a range in steps of 1 and take only fractions of a second by powers of two, in 100 µs: 5, 10,
+    20, 39, 78, 156, 312, 625, 1250, 2500, 5000, 10000, 20000 (Microsoft LifeCam HD-3000; so in wpilibsuite/allwpilib,
+    cscore, `quirkLifeCamHd3000`).
+    """
+    try:
+        set_control(handle, node, control, units)
+    except UnsupportedByDeviceError as refusal:
+        if not isinstance(refusal.__cause__, OSError):
+            raise
+        halves = [each for each in _HALVES if control.accepts(each)]
+        for nearest in sorted(halves, key=lambda each: abs(math.log(each / units)))[:2]:
+            with suppress(UnsupportedByDeviceError):
+                set_control(handle, node, control, nearest)
+                return
+        raise
+
+
 def _refusal(error: OSError, control: Control) -> str:
-    number = error.errno or 0
-    refusal = f"refuses it ({os.strerror(number)})"
-    if number in (*kernel.REFUSED, errno.EACCES, errno.EBUSY):
-        return refusal
-    return (
-        f"{refusal}: the camera answers this control with a fault and is still connected; skip_controls = "
-        f'["{control.name}"] in its table leaves it alone'
-    )
+    refusal = f"refuses it ({os.strerror(error.errno or 0)})"
+    leave = f'skip_controls = ["{control.name}"] in its table leaves it alone'
+    if error.errno in (*kernel.REFUSED, errno.EACCES, errno.EBUSY):
+        return f"{refusal}; {leave}"
+    return f"{refusal}: the camera answers this control with a fault and is still connected; {leave}"
 
 
 def gain_control(controls: Controls) -> Control | None:
@@ -236,9 +261,18 @@ def exposure_control(controls: Controls) -> Control | None:
     return controls.get(EXPOSURE_ABSOLUTE) or controls.get(EXPOSURE_LINES)
 
 
+@dataclass(frozen=True, slots=True)
+class ControlSetting:
+    """A control to set. needed : frames cannot be used without it, or the user names it."""
+
+    control: Control
+    value: int
+    needed: bool
+
+
 def ordered_settings(
     controls: Controls, options: V4L2Options, *, exposure_units: int | None, gain_units: int | None, node: Path
-) -> tuple[tuple[Control, int], ...]:
+) -> tuple[ControlSetting, ...]:
     """Return every control to set and its value, in the order in which devices accept them.
 
     An automatic comes before the control that it governs. A control that the rig file names must exist; others are set
@@ -251,36 +285,52 @@ def ordered_settings(
     """
     if options.focus is not None and FOCUS_ABSOLUTE not in controls:
         raise _missing_control("focus", controls, node)
-    steps: list[tuple[Control, int]] = []
-    for control, value in (
-        (controls.get(EXPOSURE_AUTO), _MANUAL),
-        (exposure_control(controls), exposure_units),
-        (controls.get(AUTOGAIN), _OFF),
-        (gain_control(controls), gain_units),
-        (controls.get(FOCUS_AUTO), _OFF),
-        (controls.get(FOCUS_ABSOLUTE), options.focus),
-        (controls.get(AUTO_WHITE_BALANCE), _OFF),
-        (controls.get(POWER_LINE_FREQUENCY), _OFF),
+    steps: list[ControlSetting] = []
+    for control, value, needed in (
+        (controls.get(EXPOSURE_AUTO), _MANUAL, True),
+        (exposure_control(controls), exposure_units, True),
+        (controls.get(AUTOGAIN), _OFF, False),
+        (gain_control(controls), gain_units, True),
+        (controls.get(FOCUS_AUTO), _OFF, False),
+        (controls.get(FOCUS_ABSOLUTE), options.focus, True),
+        (controls.get(AUTO_WHITE_BALANCE), _OFF, False),
+        (controls.get(POWER_LINE_FREQUENCY), _OFF, False),
     ):
         if control is None or value is None:
             continue
         # Some devices have mains filters that cannot be switched off; with manual exposure they do nothing.
         if control.number == POWER_LINE_FREQUENCY and not control.accepts(value):
             continue
-        steps.append((control, value))
+        steps.append(ControlSetting(control, value, needed))
     named = {control.name: control for control in controls.values()}
     for name, value in options.controls.items():
         if name not in named:
             raise _missing_control(name, controls, node)
-        steps.append((named[name], value))
-    for control, value in steps:
-        if not control.accepts(value):
+        steps.append(ControlSetting(named[name], value, needed=True))
+    for step in steps:
+        if step.needed and not step.control.accepts(step.value):
             message = (
-                f"{node}: requested {control.name} = {value}, the device accepts {control.minimum} to "
-                f"{control.maximum}; write a value in that range"
+                f"{node}: requested {step.control.name} = {step.value}, the device accepts {step.control.minimum} to "
+                f"{step.control.maximum}; write a value in that range"
             )
             raise UnsupportedByDeviceError(message)
     return tuple(steps)
+
+
+def require_focus(handle: int, node: Path, controls: Controls, options: V4L2Options) -> None:
+    """Raise UnsupportedByDeviceError where the lens can be moved, and the user does not say where it is to stand.
+
+    Another program, a new plug or the camera itself moves it, and a calibration holds for one place.
+    """
+    lens = controls.get(FOCUS_ABSOLUTE)
+    if lens is None or options.focus is not None or lens.name in options.controls:
+        return
+    message = (
+        f"{node}: a motor moves its lens, and a calibration holds for one place of it. Make the picture sharp, and "
+        f"write where the lens stands then into the camera's table: focus = {get_control(handle, node, lens)} is where "
+        f'it stands now. Where no motor moves it: skip_controls = ["{lens.name}"]'
+    )
+    raise UnsupportedByDeviceError(message)
 
 
 def _missing_control(name: str, controls: Controls, node: Path) -> UnsupportedByDeviceError:
@@ -296,8 +346,8 @@ def switch_off_processing(
     Sharpening makes halos at edges, which move stripes near a printed edge; a tone curve, or one that follows the
     picture (backlight compensation, high dynamic range), makes equal light give unequal greys; noise reduction mixes
     neighbours and frames. A frame rate that follows the light makes exposure times unknown. Stabilisation moves the
-    picture. Zoom, pan and tilt keep the values of the last program, and a calibration holds for one value of each: they
-    are set to their defaults.
+    picture. Zoom, pan and tilt keep the values of the last program, and a calibration holds for one value of each; a
+    brightness that it left clips black: they are set to their defaults.
 
     Gamma: the USB Video Class counts it in hundredths, 1 to 500, so 100 is a gamma of 1 (USB Device Class Definition
     for Video Devices 1.5, Processing Unit, "Gamma Control"; the same in Windows' KSPROPERTY_VIDEOPROCAMP_GAMMA). Many

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from drivers.v4l2 import kernel
+from drivers.v4l2.controls import FOCUS_ABSOLUTE
 from slrig.errors import DeviceGoneError
 
 SYSFS = Path("/sys/class/video4linux")
@@ -26,7 +27,7 @@ DEV = Path("/dev")
 @dataclass(frozen=True, slots=True)
 class NodeIdentity:
     """Identity of a node. captures : it streams frames in one plane. is_uvc : it uses the kernel's driver for USB Video
-    Class cameras.
+    Class cameras. focus : where its lens stands; None without a motor.
     """
 
     card: str
@@ -34,17 +35,21 @@ class NodeIdentity:
     captures: bool
     several_planes: bool = False
     is_uvc: bool = False
+    focus: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class CameraNode:
-    """A camera's node and its permanent name. serial : serial number of the USB device, or ""."""
+    """A camera's node and its permanent name. serial : serial number of the USB device, or "". focus : see
+    `NodeIdentity`.
+    """
 
     path: Path
     name: str
     card: str
     serial: str
     note: str = ""
+    focus: int | None = None
 
 
 _NO_CAMERA = NodeIdentity(card="", bus="", captures=False)
@@ -75,11 +80,20 @@ def probe_node(path: Path) -> NodeIdentity | None:
     except OSError as error:
         return None if error.errno in (errno.EACCES, errno.EPERM) else _NO_CAMERA
     try:
-        return query_identity(handle)
+        return replace(query_identity(handle), focus=_focus(handle))
     except OSError:
         return _NO_CAMERA
     finally:
         os.close(handle)
+
+
+def _focus(handle: int) -> int | None:
+    answer = kernel.ControlValue(id=FOCUS_ABSOLUTE)
+    try:
+        kernel.ioctl(handle, kernel.G_CTRL, answer)
+    except OSError:
+        return None
+    return int(answer.value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +126,8 @@ def list_nodes(
         name = (by_id.get(real) if is_unique else None) or by_path.get(real) or _bus_name(candidate)
         serial = candidate.usb[2] if candidate.usb is not None else ""
         note = "" if candidate.identity is not None else "may not be opened: sudo usermod -aG video $USER"
-        found.append(CameraNode(candidate.path, name, candidate.label, serial, note))
+        focus = None if candidate.identity is None else candidate.identity.focus
+        found.append(CameraNode(candidate.path, name, candidate.label, serial, note, focus))
     return _rename_duplicates(found, {candidate.path: _bus_name(candidate) for candidate in candidates})
 
 

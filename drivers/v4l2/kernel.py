@@ -328,9 +328,10 @@ def device_error(node: Path, action: str, error: OSError) -> DeviceError:
         )
     if number == errno.ENOSPC:
         return UnsupportedByDeviceError(
-            f"{cause}; the USB bus has not enough bandwidth left for this stream: plug the cameras "
-            "into different USB controllers (lsusb -t), or request a smaller size_px, a lower frame_rate_hz, or "
-            'pixel_format = "MJPG"'
+            f"{cause}; the USB bus has not enough bandwidth left for this stream: plug the cameras into different USB "
+            "controllers (lsusb -t). Many webcams ask for the whole bus whatever they send: for a raw format, sudo "
+            "modprobe -r uvcvideo and sudo modprobe uvcvideo quirks=0x80 has the kernel reckon what it takes. Or "
+            'request a smaller size_px, a lower frame_rate_hz, or pixel_format = "MJPG"'
         )
     if number in REFUSED:
         return UnsupportedByDeviceError(f"{cause}; the device cannot do that (slrig devices lists the cameras)")

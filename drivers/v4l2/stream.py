@@ -106,6 +106,9 @@ MIN_RATE_HZ = 15.0
 
 _RATE_TOLERANCE = 0.01
 
+PERIOD_TOLERANCE = 0.02
+"""Part of the frame period by which an exposure may exceed it."""
+
 _BROKEN = select.POLLERR | select.POLLHUP | select.POLLNVAL
 _SEQUENCE_MODULUS = 2**32
 _MAX_STEP = 2**31
@@ -113,13 +116,22 @@ _MAX_STEP = 2**31
 
 @dataclass(frozen=True, slots=True)
 class NegotiatedFormat:
-    """The format in use. period_ns : time from frame to frame. notes : remarks for the user."""
+    """The format in use. period_ns : time from frame to frame. slower_ns : longer ones that may take its place, where
+    the user names no rate; in rising order. notes : remarks for the user.
+    """
 
     layout: PixelLayout
     size: Size
     stride_bytes: int
     period_ns: int
+    slower_ns: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
+
+    def period_for(self, exposure_s: float) -> int:
+        """The shortest period, ns, that an exposure fits into; the longest where it fits into none."""
+        periods_ns = (self.period_ns, *self.slower_ns)
+        fitting = (each for each in periods_ns if exposure_s * 1e9 <= each * (1 + PERIOD_TOLERANCE))
+        return next(fitting, periods_ns[-1])
 
 
 def negotiate_format(handle: int, node: Path, options: V4L2Options) -> NegotiatedFormat:
@@ -151,7 +163,9 @@ def negotiate_format(handle: int, node: Path, options: V4L2Options) -> Negotiate
         except OSError as error:
             raise kernel.device_error(node, f"requesting {code.strip()} {size}", error) from error
         _require_format(handle, node, code, size, pix)
-        period_ns = _period_ns(handle, node, options, _rates_hz(handle, code, size))
+        offered_hz = _rates_hz(handle, code, size)
+        period_ns = _period_ns(handle, node, options, offered_hz)
+        slower_ns = sorted(round(1e9 / each) for each in offered_hz if each * period_ns < 1e9 * (1 - _RATE_TOLERANCE))
     except OSError as error:
         raise kernel.device_error(node, "setting format and frame rate", error) from error
     layout = _layout(code, options, node)
@@ -161,7 +175,8 @@ def negotiate_format(handle: int, node: Path, options: V4L2Options) -> Negotiate
             f"gives {1e9 / period_ns:.3g} frames per second in {code.strip()} {size}, which makes scans slow: choose a "
             f"smaller size_px or another pixel_format (v4l2-ctl -d {node} --list-formats-ext lists what is faster)",
         )
-    return NegotiatedFormat(layout, size, int(pix.bytesperline), period_ns, notes)
+    slower = tuple(slower_ns) if options.frame_rate_hz is None else ()
+    return NegotiatedFormat(layout, size, int(pix.bytesperline), period_ns, slower, notes)
 
 
 def _choose_format(handle: int, node: Path, options: V4L2Options, offered: tuple[str, ...]) -> tuple[str, Size | None]:
@@ -312,6 +327,15 @@ def _set_rate_hz(handle: int, wanted_hz: float) -> float | None:
     answer.parm.capture.timeperframe = kernel.Fraction(period.numerator, period.denominator)
     _request_if_supported(handle, kernel.S_PARM, answer)
     return _rate_hz(handle)
+
+
+def set_period(handle: int, node: Path, period_ns: int) -> int:
+    """Set the time from frame to frame while the stream is off; return what the driver gives. Raises DeviceError."""
+    try:
+        rate_hz = _set_rate_hz(handle, 1e9 / period_ns)
+    except OSError as error:
+        raise kernel.device_error(node, "setting its frame rate", error) from error
+    return period_ns if rate_hz is None else round(1e9 / rate_hz)
 
 
 def _rate_hz(handle: int) -> float | None:

@@ -305,19 +305,21 @@ def _named(kind: str, text: str, found: DiscoveredDevices, name: str) -> RigFile
     if not device and len(devices) > 1:
         message = f"--{kind} {text}: {_listed(devices)}; name one of them: --{kind} {driver}:{devices[0].device}"
         raise ConfigError(message)
-    label = next((each.label for each in devices if device in ("", each.device)), "")
-    return _part(kind, driver, device or next((each.device for each in devices), ""), label, name)
+    found_one = next((each for each in devices if device in ("", each.device)), FoundDevice(driver, device, ""))
+    return _part(kind, found_one, name)
 
 
-def _part(kind: str, driver: str, device: str, label: str, name: str) -> RigFileTable:
+def _part(kind: str, found: FoundDevice, name: str) -> RigFileTable:
     """The table of a device. It is named by the option of which the driver's model says `json_schema_extra={"takes":
     "device"}`, else by `device`.
     """
+    driver, device, label = found.driver, found.device, found.label
     if not device:
         return RigFileTable(kind, driver, label, {}, name)
     known = _properties(driver)
     key = next((key for key, part in known.items() if part.get("takes") == "device"), "device")
-    return RigFileTable(kind, driver, label, {key: typed(device, json_types(known.get(key, {"type": "string"})))}, name)
+    named = {key: typed(device, json_types(known.get(key, {"type": "string"})))}
+    return RigFileTable(kind, driver, label, {**named, **found.options}, name)
 
 
 def _chosen_cameras(offered: Sequence[FoundDevice], *, ask: bool) -> list[RigFileTable]:
@@ -327,10 +329,7 @@ def _chosen_cameras(offered: Sequence[FoundDevice], *, ask: bool) -> list[RigFil
         everyone = " ".join(str(number + 1) for number in range(len(offered)))
         _say("Give the numbers of those of the rig, left to right; one that holds several cameras may be given twice.")
         chosen = _ask("Cameras", everyone, lambda text: [_numbered(offered, each) for each in text.split()])
-    return [
-        _part("camera", each.driver, each.device, each.label, _name(number, len(chosen)))
-        for number, each in enumerate(chosen)
-    ]
+    return [_part("camera", each, _name(number, len(chosen))) for number, each in enumerate(chosen)]
 
 
 def _chosen_projector(offered: Sequence[FoundDevice], *, ask: bool) -> RigFileTable:
@@ -343,7 +342,7 @@ def _chosen_projector(offered: Sequence[FoundDevice], *, ask: bool) -> RigFileTa
         _offer("Projectors", offered)
         usual = "1" if len(offered) == 1 else None
         chosen = _ask("Projector", usual, lambda text: _numbered(offered, text))
-    return _part("projector", chosen.driver, chosen.device, chosen.label, "projector")
+    return _part("projector", chosen, "projector")
 
 
 def _exposure_s(given: float | None, *, ask: bool) -> float:

@@ -143,7 +143,11 @@ def require_displayed(value: object, index: int, now_ns: int) -> DisplayedPatter
 
 def require_found(value: object) -> FoundDevice:
     """Return a device that was found."""
-    return _printable(require_kind(value, FoundDevice))
+    found = _printable(require_kind(value, FoundDevice))
+    for name, option in require_kind(found.options, dict).items():
+        require_kind(name, str)
+        require_kind(option, str) if isinstance(option, str) else require_number(option, f"the option {name}")
+    return found
 
 
 def _is_whole(value: object, limit: int) -> bool:

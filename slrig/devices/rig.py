@@ -169,11 +169,14 @@ class ScannerHead(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class FoundDevice:
-    """A connected device: its driver, its id for the rig file, and a label."""
+    """A connected device: its driver, its id for the rig file, and a label. options : further ones for its table, as
+    the device stands now, which it is not opened without.
+    """
 
     driver: str
     device: str
     label: str
+    options: Mapping[str, float | str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -145,6 +145,7 @@ class CameraSession:
         self.exposure_s = rig.settings[name].exposure_s
         self._wait_ns = round(wait_s * _NS)
         self._never = threading.Event()
+        self._range_s = self.camera.info.exposure_range_s
         offered = self.camera.info.triggers
         possible = [trigger for trigger in (Trigger.SOFTWARE, Trigger.FREE) if trigger in offered]
         if not possible:
@@ -166,9 +167,14 @@ class CameraSession:
         return self.rig.projector
 
     def clamp_exposure_s(self, exposure_s: float) -> float:
-        """Return the nearest exposure in the range that the camera declares."""
-        min_s, max_s = self.camera.info.exposure_range_s
+        """Return the nearest exposure in the range that the camera declares, as far as it was not found out to end."""
+        min_s, max_s = self._range_s
         return min(max(exposure_s, min_s), max_s)
+
+    def limit_exposure(self, good_s: float, refused_s: float) -> None:
+        """Take note that the camera refused an exposure of its declared range, and took another one."""
+        min_s, max_s = self._range_s
+        self._range_s = (min_s, good_s) if refused_s > good_s else (good_s, max_s)
 
     @contextmanager
     def arm(self, sequence: PatternSequence | None, exposure_s: float, frames: int) -> Iterator[None]:
@@ -262,8 +268,12 @@ def measure_light(
         is_dark_to_the_end = not _is_visible(levels) and next_s > max(_MAX_SEARCH_EXPOSURE_S, own_s)
         if abs(next_s / exposure_s - 1) < 0.02 or is_dark_to_the_end:
             break
-        exposure_s = next_s
-        levels, frame = _measure_levels(session, sequence, exposure_s)
+        try:
+            levels, frame = _measure_levels(session, sequence, next_s)
+        except UnsupportedByDeviceError:
+            # A declared range is a bound: between this exposure and the last one is where it ends.
+            session.limit_exposure(exposure_s, next_s)
+            break
         exposure_s = session.exposure_s
     if not _is_visible(levels):
         return None, [_explain_missing_light(subject, own_levels, levels, own_s, displays)]

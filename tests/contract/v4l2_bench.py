@@ -87,8 +87,10 @@ class Faked:
     """A fake camera. Times in seconds; `stamp`, `lost` and their like as in `v4l2_kernel`.
 
     rates_of : times per frame of one format and size ("YUYV 160 x 120"), in place of `rates`. line_s : what a unit of
-    its exposure in lines lasts. A control may have `kind`, `flags`, `insists_on`, `stalls` (the requests "describe",
-    "get", "set" that it answers with `errno`), and `long`, a 64-bit value.
+    its exposure in lines lasts. first_frame_s : from the start of the stream to its first frame. forgets_at_start : its
+    exposure is the default then, whatever its driver says. A control may have `kind`, `flags`, `insists_on`, `takes`
+    (the only values that it does not refuse), `stalls` (the requests "describe", "get", "set" that it answers with
+    `errno`), and `long`, a 64-bit value.
     """
 
     formats: Mapping[str, list[tuple[int, int]]] = field(
@@ -111,6 +113,8 @@ class Faked:
     tells_rate: bool = True
     stretches: bool = True
     padding_bytes: int = 0
+    first_frame_s: float = 0.0
+    forgets_at_start: bool = False
     seed: int = 0
     nodes: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: {"video0": {}})
 
@@ -118,7 +122,7 @@ class Faked:
         keys = (
             *("rates_of", "driver", "line_s"),
             *("formats", "rates", "controls", "stamp", "readout_s", "jitter_s", "lag_frames", "lost", "corrupt"),
-            *("flags_corrupt", "tells_rate", "stretches", "padding_bytes", "seed"),
+            *("flags_corrupt", "tells_rate", "stretches", "padding_bytes", "seed", "first_frame_s", "forgets_at_start"),
         )
         most = max(width * height for sizes in self.formats.values() for width, height in sizes)
         usual = {"card": "Bench camera", "bus": "usb-0000:00:14.0-2", "capabilities": 0x04200001}
@@ -195,7 +199,9 @@ class VirtualDevice:
         self._leaving = ExitStack()
 
     def open_camera(self, **options: object) -> V4L2Camera:
-        camera = open_camera("left", {"device": str(NODE), **options}, Path())
+        names = {each["name"] for each in self.kernel.config["controls"]}
+        lens = {"focus": 0} if "Focus, Absolute" in names else {}
+        camera = open_camera("left", {"device": str(NODE), **lens, **options}, Path())
         assert isinstance(camera, V4L2Camera)
         self._leaving.callback(camera.close)
         return camera

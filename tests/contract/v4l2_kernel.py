@@ -78,7 +78,7 @@ class Sensor:
 
     def start(self, period_ns: int, exposure_ns: int) -> None:
         self.period_ns = max(period_ns, exposure_ns) if self.config["stretches"] else period_ns
-        self.begun_ns = self.now_ns()
+        self.begun_ns = self.now_ns() + round(self.config["first_frame_s"] * 1e9)
         # The settings of the stream before are in use for a few frames yet.
         self.before_ns, self.exposure_ns = self.exposure_ns or exposure_ns, exposure_ns
         self.coming = self.drawn(0, 0)
@@ -292,12 +292,18 @@ class Device:
             raise Refused(errno.EBUSY)
         if self.has_fault("no bandwidth"):
             raise Refused(errno.ENOSPC)
-        exposure_ns = self.values.get(EXPOSURE_ABSOLUTE, 0) * 100_000
-        if EXPOSURE_LINES in self.values:
-            exposure_ns = round(self.values[EXPOSURE_LINES] * self.config["line_s"] * 1e9)
+        exposure_ns = self.exposure_ns()
+        if self.config["forgets_at_start"]:
+            # What it was set to stays in the driver's memory.
+            exposure_ns = self.controls[EXPOSURE_ABSOLUTE]["default"] * 100_000
         period_ns = round(self.rate[0] / self.rate[1] * 1e9)
         self.sensor.start(period_ns, exposure_ns or period_ns)
         self.streaming = True
+
+    def exposure_ns(self) -> int:
+        if EXPOSURE_LINES in self.values:
+            return int(self.values[EXPOSURE_LINES] * self.config["line_s"] * 1e9 + 0.5)
+        return int(self.values.get(EXPOSURE_ABSOLUTE, 0) * 100_000)
 
     def stop(self, file: object) -> None:
         if self.owner is file:
@@ -400,6 +406,10 @@ class Device:
         # Automatic exposure rules; and a stubborn control takes what it likes. Neither says so.
         if number in (EXPOSURE_ABSOLUTE, EXPOSURE_LINES) and self.values.get(EXPOSURE_AUTO, 1) != 1:
             return
+        if value not in control.get("takes", (value,)):
+            raise Refused(errno.ERANGE)
         value = control.get("insists_on", value)
         self.values[number] = min(max(value, control["minimum"]), control["maximum"])
         self.was_set(control["name"], self.values[number])
+        if self.streaming and number in (EXPOSURE_ABSOLUTE, EXPOSURE_LINES):
+            self.sensor.exposure_ns = self.exposure_ns()

@@ -23,7 +23,7 @@ from tests.unit import test_discovery
 from tests.unit.command import slrig
 
 LEFT = FoundDevice("v4l2", "usb-046d_C920_1A-video-index0", "HD Pro Webcam C920 (/dev/video0)")
-RIGHT = FoundDevice("v4l2", "usb-046d_C920_2B-video-index0", "HD Pro Webcam C920 (/dev/video2)")
+RIGHT = FoundDevice("v4l2", "usb-046d_C920_2B-video-index0", "HD Pro Webcam C920 (/dev/video2)", {"focus": 30})
 HDMI = FoundDevice("screen", "HDMI-1", "HDMI-1 (Acer H6510, 1280x720 at 60.00 Hz)")
 LAPTOP = FoundDevice("screen", "eDP-1", "eDP-1 (1920x1080 at 60.00 Hz)")
 BOX = FoundDevice("serial_projector", "/dev/serial/by-id/usb-MicroPython-if00", "MicroPython on an RP2040")
@@ -70,7 +70,7 @@ def test_two_webcams_and_a_screen_lead_to_a_rig_file(bench: Bench) -> None:
     assert (rig.projector.driver, rig.projector.options) == ("screen", {"output": "HDMI-1"})
     assert [(each.name, each.driver, each.options) for each in rig.cameras] == [
         ("left", "v4l2", {"device": LEFT.device}),
-        ("right", "v4l2", {"device": RIGHT.device}),
+        ("right", "v4l2", {"device": RIGHT.device, "focus": 30}),
     ]
     assert [each.exposure_s for each in rig.cameras] == [0.0167, 0.0167]
     text = bench.path.read_text(encoding="utf-8")

@@ -46,7 +46,7 @@ def fetched(client: TestClient) -> dict[str, tuple[int, bytes]]:
     """Every file of every job and calibration that the service lists, with its status."""
     paths = set()
     for each in (*client.get("/scan").json()["scans"], *client.get("/model").json()["models"]):
-        paths.update(each["links"]["files"].values())
+        paths.update(client.get(each["links"]["self"]).json()["links"]["files"].values())
     for each in client.get("/calibration").json()["calibrations"]:
         paths.update(f"/calibration/{each['id']}/{name}" for name in ("calibration.json", "report.html"))
         paths.add(f"/calibration/{each['id']}/pose/1/picture.png")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 
 from simulated_rig.device import SimulatedHead, open_head
-from slrig.devices import Camera, CameraSettings, Projector, Rig, Trigger
+from slrig.devices import AppliedSettings, Camera, CameraSettings, Projector, Rig, Trigger
 from slrig.doctor import timing
 from slrig.doctor.doctor import Diagnosis, doctor_sequence, examine
 from slrig.doctor.image import check_sharpening
@@ -44,22 +45,29 @@ Process = Callable[[Pixels], Pixels]
 class OtherCamera:
     """A rendered camera that is another in what a test names. lose : the reads, counted from 1, that time out.
 
-    change : what it makes of its frames before it gives them.
+    change : what it makes of its frames before it gives them. longest_s : the exposure that it really takes.
     """
 
     def __init__(
         self, camera: Camera, *, lose: Container[int] = (), change: Callable[[Frame], Frame] = lambda each: each,
-        **info: Any,
+        longest_s: float = math.inf, **info: Any,
     ) -> None:  # fmt: skip
-        self._camera, self._lose, self._change = camera, lose, change
+        self._camera, self._lose, self._change, self._longest_s = camera, lose, change, longest_s
         self.info = replace(camera.info, **info)
         self._reads = 0
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._camera, name)
 
+    def configure(self, settings: CameraSettings) -> AppliedSettings:
+        self._applied = self._camera.configure(settings)
+        return self._applied
+
     def arm(self, count: int, trigger: Trigger) -> None:
         assert trigger in self.info.triggers
+        if self._applied.exposure_s > self._longest_s:
+            message = "its frames are shorter"
+            raise UnsupportedByDeviceError(message)
         self._camera.arm(count, trigger)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
@@ -192,6 +200,16 @@ def test_vague_time_stamps_are_not_blamed_on_the_projector(rig: Rig, is_stated: 
     assert found.name == name
     assert found.subject == ("camera 'eye'" if is_stated else "projector")
     assert ("they limit the measurement" in found.found) is is_stated
+
+
+def test_exposure_that_a_dim_camera_declares_and_refuses_ends_the_search_alone(rig: Rig) -> None:
+    def dimmed(frame: Frame) -> Frame:
+        return replace(frame, image=frame.image // 8)
+
+    camera = with_camera(rig, change=dimmed, longest_s=0.03, exposure_range_s=(1e-4, 0.2))
+    diagnosis = run_doctor(camera)
+    assert names(diagnosis, Severity.FAULT) == set()
+    assert {"exposure.range", "timing.late", "flicker.none"} <= names(diagnosis, Severity.OK)
 
 
 def test_rig_without_calibration_has_its_picture_checked_and_its_drivers_notes_reported(rig: Rig) -> None:

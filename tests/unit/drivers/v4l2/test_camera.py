@@ -75,7 +75,7 @@ def test_options_that_the_device_does_not_support_are_refused(
 
 
 def test_a_control_that_keeps_another_value_is_refused(plugged: Plug) -> None:
-    camera = plugged(Faked(controls=changed("Exposure Time, Absolute", insists_on=100))).open_camera(**FAST)
+    camera = plugged(Faked(controls=changed("Exposure Time, Absolute", insists_on=100))).open_camera(**UNHURRIED)
     assert camera.configure(CameraSettings(0.01)).exposure_s == pytest.approx(0.01)
     with pytest.raises(UnsupportedByDeviceError, match="requested exposure_time_absolute = 20, driver gives 100"):
         camera.configure(CameraSettings(0.002))
@@ -83,7 +83,8 @@ def test_a_control_that_keeps_another_value_is_refused(plugged: Plug) -> None:
 
 def test_settings_are_rounded_to_the_steps_of_the_device(plugged: Plug) -> None:
     camera = plugged().open_camera(**FAST)
-    assert camera.info.exposure_range_s == pytest.approx((1e-4, 0.04))
+    # No longer than a frame, whatever the control accepts.
+    assert camera.info.exposure_range_s == pytest.approx((1e-4, 0.005))
     assert camera.info.gain_range == (1.0, 8.0)
     applied = camera.configure(CameraSettings(1 / 300, 1.52))
     assert (applied.exposure_s, applied.gain) == pytest.approx((0.0033, 1.5))
@@ -121,9 +122,11 @@ def test_without_options_the_best_fast_format_is_used(
 
 
 def test_the_least_period_is_that_of_the_frames_or_of_the_exposure(plugged: Plug) -> None:
-    camera = plugged(Faked(stretches=True)).open_camera(**FAST)
+    camera = plugged().open_camera(**FAST)
     assert camera.configure(CameraSettings(0.002)).min_period_s == pytest.approx(0.005)
-    assert camera.configure(CameraSettings(0.04)).min_period_s == pytest.approx(0.04)
+    with pytest.raises(UnsupportedByDeviceError, match=r"exposure_s 0\.04, it takes 0\.0001 to 0\.005"):
+        camera.configure(CameraSettings(0.04))
+    camera.close()
     # The usual rate is slow: the next fast one takes its place.
     camera = plugged(Faked(rates=((1, 5), (1, 60), (1, 20), (1, 10)))).open_camera()
     assert camera.configure(CameraSettings(0.01)).min_period_s == pytest.approx(1 / 20)
@@ -148,7 +151,7 @@ def test_a_device_without_controls_exposes_for_a_frame_period(plugged: Plug) -> 
     [
         # It runs at 50 frames per second, whatever was written.
         (Faked(tells_rate=False), {"frame_rate_hz": 150}, 0.002, 20e6),
-        (Faked(), {}, 0.04, 40e6),
+        (Faked(rates=((1, 100),), stretches=True), {"frame_rate_hz": 100}, 0.01, 10e6),
     ],
 )
 def test_the_frame_period_is_measured(
@@ -163,9 +166,74 @@ def test_a_device_without_a_frame_rate_needs_it_as_an_option(plugged: Plug) -> N
         plugged(Faked(tells_rate=False)).open_camera()
 
 
-def test_an_exposure_that_does_not_fit_into_the_frame_period_is_refused(plugged: Plug) -> None:
-    with pytest.raises(UnsupportedByDeviceError, match=r"frames come every 0\.005 s.*frame_rate_hz of 25 or less"):
-        armed(plugged(Faked(stretches=False)), CameraSettings(0.04))
+def test_a_long_exposure_lowers_a_rate_that_nobody_named(plugged: Plug) -> None:
+    device = plugged(Faked(rates=((1, 30), (1, 60), (1, 10), (1, 20)), stretches=False))
+    camera = device.open_camera(gain_unity=GAIN_UNITS)
+    assert camera.info.exposure_range_s == pytest.approx((1e-4, 0.04))
+    periods_s = []
+    for exposure_s in (0.01, 0.04, 0.0333, 0.002):
+        assert camera.configure(CameraSettings(exposure_s)).exposure_s == pytest.approx(exposure_s)
+        camera.arm(1, Trigger.FREE)
+        assert camera.read(0, 2).exposure_s == pytest.approx(exposure_s)
+        assert device.sensor.asked[-1]["exposure_ns"] == pytest.approx(exposure_s * 1e9)
+        periods_s.append(camera.period_ns / 1e9)
+        camera.disarm()
+    assert periods_s == pytest.approx([1 / 30, 1 / 20, 1 / 30, 1 / 30], rel=0.01)
+
+
+HALVES = [5, 10, 20, 39, 78, 156, 312]
+
+
+@pytest.mark.parametrize(("wanted_s", "taken_s"), [(1 / 60, 0.0156), (0.03, 0.0312), (0.0078, 0.0078), (0.001, 0.001)])
+def test_of_exposures_that_the_camera_takes_the_nearest_is_used(plugged: Plug, wanted_s: float, taken_s: float) -> None:
+    device = plugged(Faked(controls=changed("Exposure Time, Absolute", takes=HALVES)))
+    camera = device.open_camera(frame_rate_hz=25)
+    assert camera.configure(CameraSettings(wanted_s)).exposure_s == pytest.approx(taken_s)
+    camera.arm(1, Trigger.FREE)
+    assert camera.read(0, 2).exposure_s == pytest.approx(taken_s)
+    camera.disarm()
+    device = plugged(Faked(controls=changed("Exposure Time, Absolute", takes=[77])))
+    with pytest.raises(UnsupportedByDeviceError, match="requested exposure_time_absolute = "):
+        device.open_camera(frame_rate_hz=25).configure(CameraSettings(wanted_s))
+
+
+def test_settings_that_a_camera_forgets_at_its_start_are_sent_again(plugged: Plug) -> None:
+    device = plugged(Faked(forgets_at_start=True))
+    for exposure_s in (0.002, 0.004):
+        camera = armed(device, CameraSettings(exposure_s))
+        camera.read(0, 2)
+        assert device.sensor.asked[-1]["exposure_ns"] == pytest.approx(exposure_s * 1e9)
+        camera.close()
+
+
+@pytest.mark.parametrize(("first_frame_s", "comes"), [(3.5, True), (11.0, False)])
+def test_a_first_frame_may_be_late(plugged: Plug, first_frame_s: float, *, comes: bool) -> None:
+    device = plugged(Faked(first_frame_s=first_frame_s))
+    if comes:
+        assert armed(device).read(0, 2).image.size
+    else:
+        with pytest.raises(FrameTimeoutError, match="0 of the first 6 frames"):
+            armed(device)
+
+
+@pytest.mark.parametrize("name", ["Power Line Frequency", "White Balance, Automatic", "Focus, Automatic Continuous"])
+@pytest.mark.parametrize("number", [errno.EIO, errno.EINVAL])
+def test_an_automatic_that_is_refused_and_harmless_is_noted(plugged: Plug, name: str, number: int) -> None:
+    camera = armed(plugged(Faked(controls=changed(name, stalls=["set"], errno=number))))
+    [note] = camera.info.notes
+    assert "an automatic of its own stays as it is" in note
+    assert "skip_controls = [" in note
+    assert camera.read(0, 2).image.size
+
+
+def test_a_lens_with_a_motor_needs_its_place(plugged: Plug) -> None:
+    device = plugged(Faked(controls=changed("Focus, Absolute", default=37)))
+    with pytest.raises(UnsupportedByDeviceError, match=r"a motor moves its lens.*focus = 37 is where it stands now"):
+        device.open_camera(**FAST, focus=None)
+    for options in ({"focus": 40}, {"focus": None, "controls": {"focus_absolute": 40}}):
+        device.open_camera(**FAST, **options).close()
+        assert device.kernel.controls_set["Focus, Absolute"] == 40
+    device.open_camera(**FAST, focus=None, skip_controls=["focus_absolute"]).close()
 
 
 LINES = control(0x00980911, "Exposure", 4, 1000, 100)
@@ -178,7 +246,7 @@ def test_an_exposure_in_lines_becomes_seconds(plugged: Plug) -> None:
     # 80 pixels and 20 of blanking; a pixel rate beyond 32 bits is read whole.
     device = plugged(Faked(controls=(*BARE, LINES, BLANK, {**RATE, "long": 10_000_000}), line_s=1e-5))
     camera = device.open_camera(**FAST)
-    assert camera.info.exposure_range_s == pytest.approx((4e-5, 0.01))
+    assert camera.info.exposure_range_s == pytest.approx((4e-5, 0.005))
     assert camera.configure(CameraSettings(0.002004)).exposure_s == pytest.approx(0.002)
     assert device.kernel.controls_set["Exposure"] == 200
     camera.arm(1, Trigger.FREE)
@@ -225,10 +293,9 @@ def test_processing_is_off_and_zoom_and_pan_are_back(plugged: Plug) -> None:
         **{"HDR Sensor Mode": 0, "3D Noise Reduction": 0, "Exposure, Dynamic Framerate": 0, "Auto Exposure": 1},
         **{"Brightness, Automatic": 0, "White Balance, Auto & Preset": 0, "Image Stabilization": 0},
         **{"ISO Sensitivity, Auto": 0, "Scene Mode": 0},
-        **{"Pan, Absolute": 0, "Tilt, Absolute": 0, "Zoom, Absolute": 100},
+        **{"Pan, Absolute": 0, "Tilt, Absolute": 0, "Zoom, Absolute": 100, "Brightness": 0},
     }
     assert {name: known.get(name) for name in wanted} == wanted
-    assert "Brightness" not in known
 
 
 @pytest.mark.parametrize("closed", [True, False])

@@ -40,8 +40,8 @@ def options(**more: object) -> V4L2Options:
     return V4L2Options.model_validate({"device": "/dev/video7", **more})
 
 
-def names(steps: tuple[tuple[Control, int], ...]) -> list[tuple[str, int]]:
-    return [(control.name, value) for control, value in steps]
+def names(steps: tuple[ctl.ControlSetting, ...]) -> list[tuple[str, int]]:
+    return [(step.control.name, step.value) for step in steps]
 
 
 def test_automatic_controls_are_off_before_manual_values_are_set() -> None:
