@@ -273,16 +273,20 @@ class Sessions:
 
     def follow(self, secret: str) -> tuple[str, Session] | None:
         """Open the session of a link, once; None where it was followed before, is too old, or its key has ended."""
-        link = self._links.pop(digest(secret), None)
-        return None if link is None or not self._good(link, self._clock()) else self.open(link.name, link.key)
+        link, now = self._links.pop(digest(secret), None), self._clock()
+        good = link is not None and link.expires_at > now and self._good(link.key, now)
+        return self.open(link.name, link.key) if link is not None and good else None
 
     def open(self, name: str, key: str) -> tuple[str, Session]:
         """Open a session by a key: the secret for the cookie, and the session. Where the key has its share of them, its
         oldest ends for this one. Raises HTTPException 429: it has none, and others have all.
         """
         now = self._clock()
-        # In their order, and without those of keys that have ended.
-        self._open = {each: session for each, session in self._open.items() if self._good(session, now)}
+        # In their order, and without those of keys that have ended; a key is looked up once.
+        good = {key: self._good(key, now) for key in {session.key for session in self._open.values()}}
+        self._open = {
+            each: session for each, session in self._open.items() if good[session.key] and session.expires_at > now
+        }
         try:
             self._shares.require(name, Counter(session.name for session in self._open.values()))
         except HTTPException:
@@ -300,9 +304,9 @@ class Sessions:
         found = self._open.get(digest(secret))
         return found if found is not None and found.expires_at > self._clock() else None
 
-    def _good(self, session: Session, now: datetime) -> bool:
-        key = self.ring.by_digest(session.key)
-        return session.expires_at > now and key is not None and key.fault(now) is None
+    def _good(self, identity: str, now: datetime) -> bool:
+        key = self.ring.by_digest(identity)
+        return key is not None and key.fault(now) is None
 
     def close(self, secret: str) -> None:
         """Log out. Idempotent."""
