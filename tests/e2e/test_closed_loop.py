@@ -331,6 +331,7 @@ device = "/dev/video0"
 exposure_s = {exposure_s}
 frame_rate_hz = 50
 gain_unity = 16
+focus = 0
 """
 SCREEN = """driver = "screen"
 output = "{output}"
