@@ -12,7 +12,7 @@ from slrig.capture.exposure import (
     judge_exposure,
     round_to_refresh_s,
 )
-from slrig.capture.frame_checks import NEAR_SATURATION, NOISE_FLOOR_DN, SampleMask, Samples
+from slrig.capture.frame_checks import NEAR_SATURATION, NOISE_FLOOR_DN, Contradiction, SampleMask, Samples
 from slrig.capture.frame_light import FrameLight
 from slrig.capture.frame_order import describe_indices
 from slrig.capture.latency import (
@@ -39,6 +39,7 @@ __all__ = [
     "SETTINGS_TOLERANCE",
     "STEADY_TOLERANCE",
     "CameraLatency",
+    "Contradiction",
     "Evidence",
     "EvidenceSummary",
     "ExposureFault",

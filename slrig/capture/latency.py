@@ -32,6 +32,13 @@ _STAMP_NOISE_S = 2e-5  # assumed standard deviation of time stamps
 _MIN_SKEW_S = 1e-4  # of a whole shutter that counts as rolling
 _T_TEST_LEVEL = 0.999  # one-sided, for a line time
 
+_MAX_LATE_FRACTION = 1 / 12
+"""Of the flashes that may be left out as late ones: a scan shoots as many of its frames again."""
+_MIN_GAP_SPREADS = 0.5
+"""Between late flashes and the others, in spreads of the others. The last of n flashes of a uniform law is as far from
+the others with probability (2/3)ⁿ⁻², which is 2 % for 12 of them."""
+_MIN_GAP_S = 2e-3  # waiting for so little longer costs nothing
+
 _WHITE, _BLACK = 0, 1
 _STEADY_FRAMES = 8  # of white and of black, for mean, noise and period
 _FRAMES_AFTER = 3  # in the new light, at the end of a flash
@@ -119,6 +126,10 @@ class TransitionRows:
 class CameraLatency:
     """Time from the instant stated by the projector to the light, by one camera's time stamps.
 
+    A picture that missed its refresh is late once and again, and no scan waits for that: all but flashes, rows_used
+    and residual_s are of the flashes without the `late` ones, the first of which came late_s after the last of the
+    others.
+
     latency_s : mean of the flashes, ± standard_error_s; jitter_s : their standard deviation; latency_p95_s : their 95th
     percentile. rise_s, fall_s : means of the flashes to white and to black, NaN without any. settle_s : duration of the
     change after that. latest_s, earliest_s : bounds of the end and the start of a change in any row. line_time_s ±
@@ -146,6 +157,18 @@ class CameraLatency:
     rows_used: int
     residual_s: float
     flicker: float
+    late: int = 0
+    late_s: float = 0.0
+
+    @property
+    def late_words(self) -> str:
+        """What to say of the late flashes; "" without any."""
+        if not self.late:
+            return ""
+        return (
+            f"{self.late} of {self.flashes_used} flashes came late, by {self.late_s * 1e3:.3g} ms or more: pictures "
+            "that missed their refresh, which scans do not wait for and shoot again"
+        )
 
 
 def row_levels(camera: str, black: Sequence[Pixels], white: Sequence[Pixels], *, full_scale: int) -> RowLevels:
@@ -228,24 +251,26 @@ def fit_latency(camera: str, flashes: Sequence[LightChange], levels: RowLevels) 
     slope_s = line_time_s if significant else 0.0
     latencies = np.array([rows.latency_s(slope_s) for rows in transitions])
     rising = np.array([flash.to_white for flash in used])
+    late, late_s = _late_flashes(latencies, rising)
     residuals = np.concatenate(
         [rows.y_s - latency_s + slope_s * rows.row for rows, latency_s in zip(transitions, latencies, strict=True)]
     )
-    kinds = [latencies[which] for which in (rising, ~rising) if which.any()]
+    usual, rise, fall = latencies[~late], latencies[rising & ~late], latencies[~rising & ~late]
+    kinds = [each for each in (rise, fall) if len(each)]
     end_s = max(_upper_bound(each) for each in kinds)
     # A flash without transition rows also has frames after it, so it happened at the latest bound.
     latency_by_flash = {id(flash): float(latency_s) for flash, latency_s in zip(used, latencies, strict=True)}
     changed_s = [latency_by_flash.get(id(flash), end_s) for flash in flashes]
     settle_s = _settling_time_s(flashes, changed_s, slope_s, levels.flicker)
     scanned_s = max(-slope_s, 0.0) * last_row
-    jitter_s = float(latencies.std(ddof=1))
+    jitter_s = float(usual.std(ddof=1))
     return CameraLatency(
-        latency_s=float(latencies.mean()),
-        latency_p95_s=float(np.percentile(latencies, 95)),
+        latency_s=float(usual.mean()),
+        latency_p95_s=float(np.percentile(usual, 95)),
         jitter_s=jitter_s,
-        standard_error_s=jitter_s / len(pairs) ** 0.5,
-        rise_s=float(latencies[rising].mean()) if rising.any() else float("nan"),
-        fall_s=float(latencies[~rising].mean()) if (~rising).any() else float("nan"),
+        standard_error_s=jitter_s / len(usual) ** 0.5,
+        rise_s=float(rise.mean()) if len(rise) else float("nan"),
+        fall_s=float(fall.mean()) if len(fall) else float("nan"),
         settle_s=settle_s,
         latest_s=end_s + settle_s + scanned_s,
         # The instant of a change is the centroid of its light: it begins no earlier before it than it ends after it.
@@ -260,7 +285,24 @@ def fit_latency(camera: str, flashes: Sequence[LightChange], levels: RowLevels) 
         rows_used=sum(len(rows.row) for rows in transitions),
         residual_s=float(np.sqrt(np.mean(residuals**2))),
         flicker=levels.flicker,
+        late=int(late.sum()),
+        late_s=late_s,
     )
+
+
+def _late_flashes(latencies_s: FloatArray, rising: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float]:
+    """Which flashes came far later than the others of their direction, (n,) bool, and how far the first of them, s."""
+    offset_s = latencies_s.copy()
+    for which in (rising, ~rising):
+        if which.any():
+            offset_s[which] -= np.median(latencies_s[which])
+    order = np.argsort(offset_s)
+    for late in range(int(len(order) * _MAX_LATE_FRACTION), 0, -1):
+        others_s = offset_s[order[:-late]]
+        gap_s = float(offset_s[order[-late]] - others_s.max())
+        if gap_s > max(_MIN_GAP_SPREADS * float(np.ptp(others_s)), _MIN_GAP_S):
+            return np.isin(np.arange(len(order)), order[-late:]), gap_s
+    return np.zeros(len(order), np.bool_), 0.0
 
 
 def _line_time(flashes: Sequence[TransitionRows]) -> tuple[float, float]:
@@ -400,9 +442,9 @@ def measure_latency(
 
     At the end, also after errors, the projector is dark and the cameras are disarmed.
 
-    trials : number of usable flashes for each camera. search_s : maximum latency to search for. exposure_s : for the
-    test; None uses the rig's settings; longer exposures give more usable flashes. trigger : None prefers free-running
-    cameras, which expose while the projector works.
+    trials : number of usable flashes for each camera; `DEFAULT_TRIALS` where one of fewer came late.
+    search_s : maximum latency to search for. exposure_s : for the test; None uses the rig's settings; longer exposures
+    give more usable flashes. trigger : None prefers free-running cameras, which expose while the projector works.
 
     Raises ScanEvidenceError: no flash was visible, everything is saturated, or the light never changed during an
     exposure; UnsupportedByDeviceError: a camera supports hardware triggers only, or not the requested trigger or
@@ -465,8 +507,7 @@ class _FlashTest:
     ) -> CameraLatency:
         stage = f"flashes before {self.name}"
         on_progress(stage, 0.0, "steady light")
-        max_flashes = _FLASHES_PER_TRIAL * trials
-        frames = 2 * _STEADY_FRAMES + max_flashes * (_FRAMES_AFTER + 3)
+        frames = 2 * _STEADY_FRAMES + _FLASHES_PER_TRIAL * max(trials, DEFAULT_TRIALS) * (_FRAMES_AFTER + 3)
         self.camera.arm(frames, self.trigger)
         black, white = self._read_steady_frames(_BLACK), self._read_steady_frames(_WHITE)
         full_scale = self.camera.info.format.full_scale
@@ -474,7 +515,7 @@ class _FlashTest:
         flashes: list[LightChange] = []
         used = 0
         # Stop early if no flash is usable.
-        while used < trials and len(flashes) < (max_flashes if used else min(max_flashes, max(2 * trials, 16))):
+        while used < trials and len(flashes) < (_FLASHES_PER_TRIAL * trials if used else max(2 * trials, 16)):
             flash = self._flash(levels, rng, to_white=len(flashes) % 2 == 1)
             flashes.append(flash)
             used += find_transition_rows(flash, levels) is not None
@@ -482,6 +523,9 @@ class _FlashTest:
                 self.camera.disarm()
                 self.camera.arm(frames, self.trigger)
             on_progress(stage, used / trials, f"{used} of {trials} flashes")
+            if used == trials < DEFAULT_TRIALS and fit_latency(self.name, flashes, levels).late:
+                # Of more flashes the bounds are closer.
+                trials = DEFAULT_TRIALS
         return fit_latency(self.name, flashes, levels)
 
     def _read_steady_frames(self, index: int) -> list[Pixels]:

@@ -261,6 +261,8 @@ def _latency_words(found: CameraLatency) -> str:
         shutter,
         f"from {found.flashes_used} of {found.flashes} flashes, {found.rows_used} rows that fit to {ms['residual_s']}",
     ]
+    if found.late:
+        said.append(found.late_words)
     if found.flicker > STEADY_TOLERANCE:
         said.append(f"steady white flickers by {found.flicker:.0%}: make the exposure a multiple of the refresh period")
     return "\n".join(f"  {line}" for line in said)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.capture import Evidence, stable_from_ns
+from slrig.bundle import RefusedFrame
+from slrig.capture import Contradiction, Evidence, stable_from_ns
 from slrig.devices import Camera, CameraSettings, Projector, Rig, Trigger, UnknownPolarityProjector
 from slrig.doctor.measures import (
     MIN_SNR,
@@ -28,7 +29,19 @@ from slrig.doctor.measures import (
     light_levels,
 )
 from slrig.errors import FrameTimeoutError, UnsupportedByDeviceError
-from slrig.model import Axis, Black, Calibration, FloatArray, Frame, Gray, PatternSequence, Shot, White, gray_index
+from slrig.model import (
+    Axis,
+    Black,
+    Calibration,
+    FloatArray,
+    Frame,
+    Gray,
+    Pattern,
+    PatternSequence,
+    Shot,
+    White,
+    gray_index,
+)
 from slrig.patterns import cell_centre_px
 
 _NS = 1e9
@@ -528,29 +541,54 @@ def _capture_bits(
     """Return every Gray bit less its inverse, and whether the frames show the patterns that were requested."""
     patterns = sequence.patterns
     evidence = Evidence(patterns, {session.name: session.camera.info.format})
-    causes: list[str] = []
-    waiting: dict[Gray, NDArray[np.float32]] = {}
-    bars: list[BitDifference] = []
-    with session.arm(sequence, light.exposure_s, len(sequence)):
-        for index, pattern in enumerate(patterns):
-            image = session.capture_frames(index)[0].image
-            causes += [str(each) for each in evidence.add_shot(Shot(index, session.name, image))]
-            if not isinstance(pattern, Gray):
-                continue
-            positive = Gray(pattern.axis, pattern.bit, pattern.bits, pattern.cell_px, pattern.offset_px)
-            other = waiting.pop(positive, None)
-            if other is None:
-                waiting[positive] = image.astype(np.float32)
-            else:
-                difference = image.astype(np.float32) - other
-                bars.append(BitDifference(positive, -difference if pattern.inverted else difference))
+    bars: dict[Gray, BitDifference] = {}
+    with session.arm(sequence, light.exposure_s, 2 * len(sequence)):
+        found = _shoot_bits(session, patterns, range(len(patterns)), evidence, bars)
+        if found:
+            # A picture that missed its refresh is no fault of the rig: a scan shoots its frame again, too.
+            suspects = {patterns[each] for one in found for each in (*one.suspects, *one.further_suspects)}
+            suspects |= {each.inverse for each in suspects if isinstance(each, Gray)}
+            again = [index for index, each in enumerate(patterns) if each in suspects]
+            again = sorted({*again, *evidence.retract(session.name, again)})
+            for each in again:
+                evidence.record_refused(RefusedFrame(each, session.name, 1, found[0].cause, delivered=True))
+            found = _shoot_bits(session, patterns, again, evidence, bars)
     subject = camera_label(session.name)
-    if not causes:
+    if not found:
         message = f"{evidence.summary()}: it sees our patterns in their order"
-        return tuple(bars), ok("patterns.verified", subject, message)
-    message = f"{len(causes)} of {len(patterns)} frames contradict the others, the first of them: {causes[0]}"
+        return tuple(bars.values()), ok("patterns.verified", subject, message)
+    message = (
+        f"frames contradict one another, those that were shot again, too ({len(again)} of {len(patterns)}); the first "
+        f"of them: {found[0]}"
+    )
     remedy = "correct the other findings, and run the doctor again; slrig conform finds faults of drivers"
-    return tuple(bars), fault("patterns.contradicted", subject, message, remedy)
+    return tuple(bars.values()), fault("patterns.contradicted", subject, message, remedy)
+
+
+def _shoot_bits(
+    session: CameraSession,
+    patterns: Sequence[Pattern],
+    indices: Iterable[int],
+    evidence: Evidence,
+    bars: dict[Gray, BitDifference],
+) -> list[Contradiction]:
+    """Shoot some patterns, each bit with its inverse, into `evidence` and `bars`; return what contradicts."""
+    found: list[Contradiction] = []
+    waiting: dict[Gray, NDArray[np.float32]] = {}
+    for index in indices:
+        pattern = patterns[index]
+        image = session.capture_frames(index)[0].image
+        found += evidence.add_shot(Shot(index, session.name, image))
+        if not isinstance(pattern, Gray):
+            continue
+        positive = replace(pattern, inverted=False)
+        other = waiting.pop(positive, None)
+        if other is None:
+            waiting[positive] = image.astype(np.float32)
+        else:
+            difference = image.astype(np.float32) - other
+            bars[positive] = BitDifference(positive, -difference if pattern.inverted else difference)
+    return found
 
 
 def _check_orientation(

@@ -187,6 +187,8 @@ def _check_latency(measured: LatencyMeasurement, known: Synchronisation | None) 
         f"light comes {format_ms(slowest.latency_s)} ± {format_ms(slowest.standard_error_s)} after the instant that "
         f"the projector states, and is stable {format_ms(slowest.latest_s)} after it at the latest"
     )
+    if slowest.late:
+        message = f"{message}; {slowest.late_words}"
     if lateness_s(measured) > now_s + MAX_LATENESS_S:
         table = "its rig file has no [synchronisation]" if known is None else f"its rig file waits {format_ms(now_s)}"
         remedy = (

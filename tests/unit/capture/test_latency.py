@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from slrig.capture.latency import (
+    DEFAULT_TRIALS,
     CameraLatency,
     LatencyMeasurement,
     LightChange,
@@ -320,6 +322,42 @@ def test_light_that_waits_for_the_refresh_is_measured_as_jitter() -> None:
     assert found.latency_s < found.latency_p95_s <= found.latest_s
     assert found.earliest_s == pytest.approx(0.004 - 0.6e-3, abs=1e-3)
     assert found.latest_s == pytest.approx(0.004 + period_s + 0.6e-3, abs=1e-3)
+
+
+@pytest.mark.parametrize("jitter_s", [0.0, 0.016])
+def test_a_picture_that_missed_its_refresh_does_not_widen_the_window(jitter_s: float) -> None:
+    def world(*missed: int) -> World:
+        shown = count()
+
+        def light(to_white: bool, rng: np.random.Generator) -> Light:
+            late_s = 0.034 * (next(shown) in missed)
+            return both_ways(step(0.004 + late_s + float(rng.uniform(0, jitter_s))))(to_white, rng)
+
+        return World(light, exposure_s=0.02, period_s=0.021)
+
+    usual, found = world().measured(count=24), world(8).measured(count=24)
+    assert (usual.late, usual.late_words) == (0, "")
+    assert (found.late, found.late_s) == (1, pytest.approx(0.034 - jitter_s / 2, abs=0.6 * jitter_s + 3e-4))
+    assert f"1 of {found.flashes_used} flashes came late, by" in found.late_words
+    error_s = 3 * usual.standard_error_s
+    assert found.latest_s == pytest.approx(usual.latest_s, abs=error_s)
+    assert found.earliest_s == pytest.approx(usual.earliest_s, abs=error_s)
+    assert found.latency_s == pytest.approx(usual.latency_s, abs=error_s)
+    # A light that is late more often than scans may shoot again is waited for.
+    often = world(4, 9, 12, 17).measured(count=24)
+    assert often.late == 0
+    assert often.latest_s > 0.037
+
+
+def test_a_flash_that_came_late_asks_for_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = rig(tmp_path, faults={"light_delay_s": 0.012})
+    fit = fit_latency
+
+    def with_late_one(camera: str, flashes: Sequence[LightChange], levels: RowLevels) -> CameraLatency:
+        return replace(fit(camera, flashes, levels), late=1)
+
+    monkeypatch.setattr("slrig.capture.latency.fit_latency", with_late_one)
+    assert measure_latency(usual, trials=10).cameras["eye"].flashes_used == DEFAULT_TRIALS
 
 
 def test_a_ramp_is_timed_at_its_middle_and_waited_for_to_its_end() -> None:

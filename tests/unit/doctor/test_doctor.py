@@ -248,6 +248,32 @@ def test_projector_of_one_bit_has_no_response(rig: Rig) -> None:
     assert "patterns.own" not in names(diagnosis, Severity.OK)
 
 
+@pytest.mark.parametrize(("late", "name"), [([9, 17], "patterns.verified"), (range(9, 999), "patterns.contradicted")])
+def test_frames_that_contradict_are_shot_once_more(rig: Rig, late: Container[int], name: str) -> None:
+    """Frames of the pattern before, as of a display that missed its refresh; now and then, or from the tenth on."""
+    frames: list[Frame] = []
+
+    def behind(frame: Frame) -> Frame:
+        frames.append(frame)
+        return replace(frame, image=frames[-2].image) if len(frames) - 1 in late else frame
+
+    session = CameraSession(rig, "eye", wait_s=0.05)
+    sequence = doctor_sequence(rig.projector.info.size)
+    light, _ = measure_light(session, sequence, displays="")
+    assert light is not None
+    picture, findings = locate_picture(session, sequence, light, rig.calibration)
+    other, again = locate_picture(
+        CameraSession(with_camera(rig, change=behind), "eye", wait_s=0.05), sequence, light, rig.calibration
+    )
+    assert (findings[0].name, again[0].name) == ("patterns.verified", name)
+    if name == "patterns.verified":
+        assert "shot again" in again[0].found
+        assert "shot again" not in findings[0].found
+        # What was measured is of the frames that were shot last.
+        for axis, found_px in picture.position_px.items():
+            assert np.array_equal(found_px[picture.known], other.position_px[axis][picture.known])
+
+
 def grey(values: FloatArray) -> Pixels:
     return np.asarray(np.clip(np.rint(values), 0, 255), np.uint8)
 
