@@ -94,6 +94,10 @@ class SynchronisationTable(Strict):
 
     line_time_s: Annotated[dict[CameraName, LineSeconds], Field(default_factory=dict)]
 
+    stamp_error_s: Annotated[dict[CameraName, Annotated[float, Field(ge=0, le=10)]], Field(default_factory=dict)]
+    """Error of each camera's time stamps when the latency was measured. Where it is another one in a scan, as at
+    another exposure, frames keep as much more distance from changes of the light."""
+
     trigger_period_s: Annotated[float, Field(gt=0, le=10)] | None = None
     """By wire: the shortest time from one trigger pulse to the next, if the cameras need more than they declare."""
 
@@ -154,14 +158,14 @@ class RigTable(Strict):
         if twice:
             message = f"expected each camera to have a name of its own, found {', '.join(twice)} twice; rename one"
             raise ValueError(message)
-        timed = set() if self.synchronisation is None else set(self.synchronisation.line_time_s)
-        unknown = sorted(timed - set(names)) if names else []
-        if unknown:
-            message = (
-                f"expected synchronisation.line_time_s to name cameras of this rig ({', '.join(names)}), found "
-                f"{', '.join(unknown)}; correct or remove it"
-            )
-            raise ValueError(message)
+        for key in ("line_time_s", "stamp_error_s"):
+            unknown = sorted(set(getattr(self.synchronisation, key, {})) - set(names)) if names else []
+            if unknown:
+                message = (
+                    f"expected synchronisation.{key} to name cameras of this rig ({', '.join(names)}), found "
+                    f"{', '.join(unknown)}; correct or remove it"
+                )
+                raise ValueError(message)
         return self
 
 

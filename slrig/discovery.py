@@ -307,15 +307,14 @@ def _synchronisation(config: RigConfig, cameras: Mapping[str, Camera]) -> Synchr
     table = config.synchronisation
     if table is None:
         return None
-    unknown = sorted(set(table.line_time_s) - set(cameras))
-    if unknown:
-        raise ConfigError(
-            f"rig '{config.name}': synchronisation.line_time_s names {', '.join(unknown)}, the rig's cameras are "
-            f"{', '.join(sorted(cameras))}; correct it, or measure again: slrig latency"
-        )
-    return Synchronisation(
-        table.latency_s, table.latency_error_s, dict(table.line_time_s), table.trigger_period_s, table.earliest_s
-    )
+    for key in ("line_time_s", "stamp_error_s"):
+        unknown = sorted(set(getattr(table, key)) - set(cameras))
+        if unknown:
+            raise ConfigError(
+                f"rig '{config.name}': synchronisation.{key} names {', '.join(unknown)}, the rig's cameras are "
+                f"{', '.join(sorted(cameras))}; correct it, or measure again: slrig latency"
+            )
+    return Synchronisation(**table.model_dump())
 
 
 def _calibration(

@@ -384,10 +384,13 @@ def _change_interval_s(flash: LightChange) -> tuple[float, float] | None:
 
 @dataclass(frozen=True, slots=True)
 class LatencyMeasurement:
-    """Latency of each camera. shown_error_s : smallest error that the projector stated."""
+    """Latency of each camera. shown_error_s : smallest error that the projector stated. stamp_error_s : largest error
+    that each camera stated of its time stamps.
+    """
 
     cameras: Mapping[str, CameraLatency]
     shown_error_s: float
+    stamp_error_s: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def slowest(self) -> CameraLatency:
@@ -409,6 +412,7 @@ class LatencyMeasurement:
             late_s - self.shown_error_s,
             self.line_time_s,
             earliest_s=min(found.earliest_s for found in self.cameras.values()),
+            stamp_error_s=self.stamp_error_s,
         )
 
 
@@ -452,6 +456,7 @@ def measure_latency(
     """
     measured: dict[str, CameraLatency] = {}
     errors_s: list[float] = []
+    stamp_errors_s: dict[str, float] = {}
     projector = rig.projector
     try:
         profiles = tuple(np.full((1, 1), level, np.uint8) for level in (255, 0))
@@ -470,11 +475,12 @@ def measure_latency(
                 with suppress(Exception):
                     camera.disarm()
             errors_s.append(test.least_error_ns / 1e9)
+            stamp_errors_s[name] = test.stamp_error_ns / 1e9
     finally:
         with suppress(Exception):
             projector.blank()
     projector.blank()
-    return LatencyMeasurement(measured, min(errors_s))
+    return LatencyMeasurement(measured, min(errors_s), stamp_errors_s)
 
 
 def _choose_trigger(name: str, camera: Camera, requested: Trigger | None) -> Trigger:
@@ -499,6 +505,7 @@ class _FlashTest:
     trigger: Trigger
     search_s: float
     least_error_ns: int = 2**62
+    stamp_error_ns: int = 0
     period_ns: int = 0
     _never_set: threading.Event = field(default_factory=threading.Event)
 
@@ -589,4 +596,6 @@ class _FlashTest:
         return self._read(after_ns)
 
     def _read(self, after_ns: int) -> Frame:
-        return self.camera.read(after_ns, _TIMEOUT_S)
+        frame = self.camera.read(after_ns, _TIMEOUT_S)
+        self.stamp_error_ns = max(self.stamp_error_ns, frame.t_err_ns)
+        return frame

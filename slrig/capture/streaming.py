@@ -320,11 +320,12 @@ class _StreamingCapture:
         due_ns = 0
         for name in display.missing:
             state = self._camera_states[name]
-            predicted = state.cadence.start_after(display.stable_ns)
+            shift_ns = 0 if state.last is None else self._session.stamp_shift_ns(state.last)
+            predicted = state.cadence.start_after(display.stable_ns + shift_ns)
             if predicted is None or state.last is None:
                 return None
             start_ns, spare_ns = predicted
-            span_ns = state.end_ns(state.last) - state.last.t_start_ns
+            span_ns = state.end_ns(state.last) + shift_ns - state.last.t_start_ns
             due_ns = max(due_ns, start_ns + spare_ns + span_ns - self._lead.ns)
         return due_ns
 
@@ -344,17 +345,19 @@ class _StreamingCapture:
             remaining: list[tuple[Frame, str | None]] = []
             for frame, fault in state.waiting:
                 # The last pattern whose light was complete when the frame began.
-                display = next((each for each in reversed(self._displays) if frame.t_start_ns >= each.stable_ns), None)
+                shift_ns = self._session.stamp_shift_ns(frame)
+                begin_ns = frame.t_start_ns - shift_ns
+                display = next((each for each in reversed(self._displays) if begin_ns >= each.stable_ns), None)
                 if display is None:
                     continue
                 end_ns = display.end_ns
                 if end_ns is None:
                     # The next pattern is requested after now, so its light begins later than this.
                     end_ns = now_ns + min(self._earliest_ns, 0)
-                    if state.end_ns(frame) > end_ns:
+                    if state.end_ns(frame) + shift_ns > end_ns:
                         remaining.append((frame, fault))
                         continue
-                if name in display.missing and state.end_ns(frame) <= end_ns:
+                if name in display.missing and state.end_ns(frame) + shift_ns <= end_ns:
                     display.missing.remove(name)
                     self._paired.append((display.displayed.index, frame, fault))
             state.waiting = remaining

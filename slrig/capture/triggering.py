@@ -24,6 +24,9 @@ from slrig.model import Frame, Gray, PatternSequence, Primary, Shot
 SETTINGS_TOLERANCE = 0.01
 """Relative tolerance of exposure and gain."""
 
+_LEAST_SHIFT_NS = 500_000
+"""A smaller difference of the errors of time stamps is their own: a measured period, or rounding."""
+
 MAX_PLAYS = 3
 
 _MIN_CORRELATION = 0.9  # of brightness, for a shift; few cameras are linear
@@ -63,7 +66,23 @@ class CaptureSession:
 
     def read(self, name: str, after_ns: int, timeout_s: float) -> Frame:
         """Return the next frame with the camera's name in the rig. Raises as `Camera.read` does."""
-        return with_camera_name(name, self.rig.cameras[name].read(after_ns, timeout_s))
+        frame = with_camera_name(name, self.rig.cameras[name].read(after_ns, timeout_s))
+        shift_ns = self.stamp_shift_ns(frame)
+        if shift_ns and self.triggers[name] is Trigger.FREE and frame.t_start_ns < after_ns + shift_ns + frame.t_err_ns:
+            frame = with_camera_name(name, self.rig.cameras[name].read(after_ns + shift_ns, timeout_s))
+        return frame
+
+    def stamp_shift_ns(self, frame: Frame) -> int:
+        """By how much the offset of a camera's time stamps may differ from that when the latency was measured, ns.
+
+        The offset is some share of the stated error, which depends on what the stamps mean, and which is larger for
+        longer exposures. 0 where it is not known what the error was.
+        """
+        known_s = {} if self.rig.synchronisation is None else self.rig.synchronisation.stamp_error_s
+        if frame.camera not in known_s:
+            return 0
+        shift_ns = abs(frame.t_err_ns - round(known_s[frame.camera] * 1e9))
+        return shift_ns if shift_ns > _LEAST_SHIFT_NS else 0
 
     def frame_fault(self, frame: Frame, after_ns: int, previous: Frame | None) -> str | None:
         """Return a fault if a frame was exposed too early, was delivered before, or has another exposure than

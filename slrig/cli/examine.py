@@ -30,6 +30,7 @@ from slrig.doctor import (
     LatencyJob,
     Severity,
     keep,
+    known_stamp_errors_s,
     latency_from_document,
     refuse_existing,
     write_rig_file,
@@ -235,6 +236,9 @@ def _rig_table(synchronisation: Synchronisation) -> str:
     if synchronisation.line_time_s:
         lines += ["", "[synchronisation.line_time_s]"]
         lines += [f"{name} = {_number(line_s, digits=9)}" for name, line_s in synchronisation.line_time_s.items()]
+    if errors_s := known_stamp_errors_s(synchronisation):
+        lines += ["", "[synchronisation.stamp_error_s]"]
+        lines += [f"{name} = {_number(error_s)}" for name, error_s in errors_s.items()]
     return "\n".join(lines)
 
 

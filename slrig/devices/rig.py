@@ -188,8 +188,9 @@ class Synchronisation:
     that, beyond the error that the projector states; negative if the projector overstates its error. earliest_s : time
     from the stated instant to the earliest start of a change; None if not measured, and then each pattern waits for the
     frames of the previous one. line_time_s : time between the exposures of adjacent rows of each camera with a rolling
-    shutter; 0 or absent for a global shutter. trigger_period_s : shortest time between trigger pulses, written by the
-    user if the cameras report none or a shorter one.
+    shutter; 0 or absent for a global shutter. stamp_error_s : error that each camera stated of its time stamps
+    meanwhile: their unknown offset is part of the latency, and differs as this error does. trigger_period_s : shortest
+    time between trigger pulses, written by the user if the cameras report none or a shorter one.
     """
 
     latency_s: float
@@ -197,6 +198,7 @@ class Synchronisation:
     line_time_s: Mapping[str, float] = field(default_factory=dict)
     trigger_period_s: float | None = None
     earliest_s: float | None = None
+    stamp_error_s: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

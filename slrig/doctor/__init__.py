@@ -11,7 +11,7 @@ from slrig.doctor.job import (
     last_examination,
 )
 from slrig.doctor.light import Severity
-from slrig.doctor.rig_file import refuse_existing, toml_value, write_rig_file
+from slrig.doctor.rig_file import known_stamp_errors_s, refuse_existing, toml_value, write_rig_file
 
 __all__ = [
     "EXAMINATIONS",
@@ -24,6 +24,7 @@ __all__ = [
     "doctor_sequence",
     "examine",
     "keep",
+    "known_stamp_errors_s",
     "last_examination",
     "latency_from_document",
     "refuse_existing",

@@ -268,8 +268,14 @@ class _DoctorRun:
             return
         self.refresh_hz, findings = timing.measure_refresh(self.rig)
         self.findings += findings
+        scans_s = {
+            name: advise_exposure(
+                light, self.rig.cameras[name].info.exposure_range_s, refresh_hz=self.refresh_hz, flickers=()
+            ).exposure_s
+            for name, light in self.lights.items()
+        }
         self.latency, findings = timing.measure_light_latency(
-            self.rig, self.lights, search_s=self.search_s, progress=self.progress
+            self.rig, self.lights, scans_s, search_s=self.search_s, progress=self.progress
         )
         self.findings += findings
         if self.refresh_hz is not None:

@@ -15,6 +15,7 @@ from typing import Any
 
 from slrig.bundle import read_text, write_durably
 from slrig.config import MAX_CONFIG_BYTES, read_rig
+from slrig.devices import Synchronisation
 from slrig.disk import staging_name, storage_errors
 from slrig.doctor.advice import ExposureAdvice
 from slrig.doctor.doctor import Diagnosis
@@ -23,6 +24,9 @@ from slrig.errors import ConfigError
 
 _WIDTH = 116
 _SYNC = "synchronisation"
+
+_LEAST_STAMP_ERROR_S = 1e-4
+"""Smaller errors of time stamps make no difference between exposures."""
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 KeyPath = tuple[str | int, ...]
@@ -92,8 +96,20 @@ def rig_file_text(data: Mapping[str, Any], diagnosis: Diagnosis, *, source: Path
             table["line_time_s"] = {name: round(seconds, 9) for name, seconds in measured.line_time_s.items()}
             rolling = "measured: a rolling shutter exposes each row this much later than the row above it"
             comments |= dict.fromkeys(((_SYNC, "line_time_s", name) for name in measured.line_time_s), rolling)
+        if errors_s := known_stamp_errors_s(measured):
+            table["stamp_error_s"] = errors_s
+            stamps = (
+                "of the time stamps meanwhile; at other exposures, frames keep the difference from changes of light"
+            )
+            comments |= dict.fromkeys(((_SYNC, "stamp_error_s", name) for name in errors_s), stamps)
         tables[_SYNC] = table
     return "\n".join([*_heading(diagnosis, source), *_table_lines(tables, (), comments)]) + "\n"
+
+
+def known_stamp_errors_s(measured: Synchronisation) -> dict[str, float]:
+    """The errors of time stamps that are worth a line of a rig file."""
+    errors_s = measured.stamp_error_s.items()
+    return {name: round(error_s, 6) for name, error_s in errors_s if error_s > _LEAST_STAMP_ERROR_S}
 
 
 def _set_exposures(

@@ -123,19 +123,30 @@ def estimate_refresh_hz(t_visible_ns: Sequence[int]) -> float | None:
 def measure_light_latency(
     rig: Rig,
     lights: Mapping[str, LightMeasurement],
+    scans_s: Mapping[str, float],
     *,
     search_s: float,
     progress: Callable[[str, float, str], None],
 ) -> tuple[LatencyMeasurement | None, list[Finding]]:
     """Flash the projector before the cameras that see it; the measurement is None if no camera sees a flash happen.
 
+    scans_s : exposure of each camera in scans.
+
     A camera that needs triggers while the projector works may miss all flashes. For such a camera, check that frames
     taken as soon as the projector states light hold the new light alone.
     """
     settings = {name: CameraSettings(each.exposure_s, rig.settings[name].gain) for name, each in lights.items()}
     watching = replace(rig, cameras={name: rig.cameras[name] for name in lights}, settings=settings)
+    # As scans expose, if the light suffices: some time stamps are later with longer exposures.
+    as_scanned = {name: replace(each, exposure_s=scans_s[name]) for name, each in settings.items()}
+    scanning = replace(watching, settings=as_scanned)
     try:
-        measured = measure_latency(watching, trials=_FLASHES, search_s=search_s, on_progress=progress)
+        try:
+            measured = measure_latency(scanning, trials=_FLASHES, search_s=search_s, on_progress=progress)
+        except ScanEvidenceError:
+            if scanning.settings == watching.settings:
+                raise
+            measured = measure_latency(watching, trials=_FLASHES, search_s=search_s, on_progress=progress)
     except ScanEvidenceError as error:
         return None, [check_punctuality(watching, each, error) for each in lights.values()]
     findings = [_check_latency(measured, rig.synchronisation), *_check_jitter(measured, lights)]

@@ -89,8 +89,8 @@ class Faked:
     rates_of : times per frame of one format and size ("YUYV 160 x 120"), in place of `rates`. line_s : what a unit of
     its exposure in lines lasts. first_frame_s : from the start of the stream to its first frame. forgets_at_start : its
     exposure is the default then, whatever its driver says. A control may have `kind`, `flags`, `insists_on`, `takes`
-    (the only values that it does not refuse), `stalls` (the requests "describe", "get", "set" that it answers with
-    `errno`), and `long`, a 64-bit value.
+    (the only values that it does not refuse), `really_at_most` (of an exposure, whatever its driver says), `stalls`
+    (the requests "describe", "get", "set" that it answers with `errno`), and `long`, a 64-bit value.
     """
 
     formats: Mapping[str, list[tuple[int, int]]] = field(

@@ -303,7 +303,8 @@ class Device:
     def exposure_ns(self) -> int:
         if EXPOSURE_LINES in self.values:
             return int(self.values[EXPOSURE_LINES] * self.config["line_s"] * 1e9 + 0.5)
-        return int(self.values.get(EXPOSURE_ABSOLUTE, 0) * 100_000)
+        units = self.values.get(EXPOSURE_ABSOLUTE, 0)
+        return int(min(units, self.controls.get(EXPOSURE_ABSOLUTE, {}).get("really_at_most", units)) * 100_000)
 
     def stop(self, file: object) -> None:
         if self.owner is file:

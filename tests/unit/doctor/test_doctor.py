@@ -195,7 +195,8 @@ def test_vague_time_stamps_are_not_blamed_on_the_projector(rig: Rig, is_stated: 
         CameraSession(rig, "eye", wait_s=0.1), doctor_sequence(rig.projector.info.size), displays=""
     )
     assert light is not None
-    _, findings = timing.measure_light_latency(rig, {"eye": light}, search_s=0.1, progress=lambda *_: None)
+    scans_s = {"eye": light.exposure_s}
+    _, findings = timing.measure_light_latency(rig, {"eye": light}, scans_s, search_s=0.1, progress=lambda *_: None)
     [found] = [each for each in findings if each.name in {"timing.stamps", "timing.jitter"}]
     assert found.name == name
     assert found.subject == ("camera 'eye'" if is_stated else "projector")
