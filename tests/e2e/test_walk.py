@@ -34,7 +34,8 @@ def test_a_scan_of_the_rendered_rig_gives_a_mesh_and_its_bundle_gives_it_again(
         chosen = [word for name in files for word in ("--file", name)]
         said = done("scan", "--url", service.url, "--output", output, "--label", "walk", *chosen)
         with service.client() as client:
-            (scan,) = client.get("/scan")["scans"]
+            (listed,) = client.get("/scan")["scans"]
+            scan = client.get(listed["links"]["self"])
         # The events of all jobs begin after the last one that a client has had.
         headers = {"X-API-Key": KEY, "Last-Event-ID": "2"}
         with httpx2.stream("GET", f"{service.url}/events?after=0", headers=headers, timeout=60) as events:
