@@ -389,6 +389,8 @@ class JobWait:
         return WorkerLostError(message)
 
 
+_ENDED = "its process ended (if the machine ran out of memory, free some)"
+
 SILENCE_TOLD_S = 5.0
 """From when on `condition` tells that the process shows no sign of life."""
 
@@ -473,7 +475,7 @@ class Worker:
             self._loading = False
             if self._closed:
                 return
-            cause = told.cause if isinstance(told, Unloadable) else "its process ended"
+            cause = told.cause if isinstance(told, Unloadable) else _ENDED
             self._condition = f"the reconstruction cannot be loaded: {cause}; the service's log has the details"
             _log.error("the reconstruction cannot be loaded", cause=cause)
 

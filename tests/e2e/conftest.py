@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -76,10 +77,19 @@ def write_rig(folder: Path, *, scene: str = SCENE, head: str = "", faults: str =
 class ServiceProcess:
     """A running `slrig serve`; `url` is the address that it printed. port : any free one by default.
 
-    program : a module and its arguments, in place of that command.
+    program : a module and its arguments, in place of that command. descriptors : the most that it may have.
     """
 
-    def __init__(self, rig: Path, data: Path, *, port: int = 0, program: Sequence[str] = (), **settings: str) -> None:
+    def __init__(
+        self,
+        rig: Path,
+        data: Path,
+        *,
+        port: int = 0,
+        program: Sequence[str] = (),
+        descriptors: int | None = None,
+        **settings: str,
+    ) -> None:
         self.data = data
         self.log = data.with_suffix(".log")
         environment = {
@@ -98,6 +108,8 @@ class ServiceProcess:
             self.process = subprocess.Popen(  # noqa: S603 - our own command
                 [sys.executable, "-m", *command], stdout=subprocess.PIPE, stderr=log, env=environment
             )
+        if descriptors is not None:
+            resource.prlimit(self.process.pid, resource.RLIMIT_NOFILE, (descriptors, descriptors))
         assert self.process.stdout is not None
         greeting = self.process.stdout.readline().decode()
         assert " at http://" in greeting, self.log.read_text()
