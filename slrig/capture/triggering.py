@@ -29,6 +29,9 @@ _LEAST_SHIFT_NS = 500_000
 
 MAX_PLAYS = 3
 
+_SLOWER = (2, 3)
+"""How many times slower a sequence is played to a camera that misses pulses."""
+
 _MIN_CORRELATION = 0.9  # of brightness, for a shift; few cameras are linear
 _MIN_IMPROVEMENT = 0.05  # of the correlation, compared with no shift
 
@@ -199,16 +202,21 @@ class _Play:
     doubts: list[Contradiction] = field(default_factory=list)
     missing: int = 0
 
-    def misses_every_second_pulse(self, camera: str) -> bool:
-        """True if a camera's exposures begin two periods apart."""
+    def periods_apart(self, camera: str) -> int:
+        """How many periods lie between a camera's exposures: 2 or 3 if it misses pulses, as one does whose read-out is
+        not over when they come, or whose rolling shutter is slower by wire; else 1.
+        """
         apart_ns = np.diff(self.starts_ns.get(camera, ()))
-        return len(apart_ns) > 1 and 1.5 < float(np.median(apart_ns)) / (self.period_s * 1e9) < 2.5
+        periods = round(float(np.median(apart_ns)) / (self.period_s * 1e9)) if len(apart_ns) > 1 else 1
+        return periods if periods in _SLOWER else 1
 
 
 def capture_by_wire(session: CaptureSession, retries: RetryPolicy) -> Iterator[Shot]:
     """Play the sequence until every frame counts, at most three times.
 
-    Frames are yielded as they come. The frames of a failed play are rejected, and all come again.
+    Frames are yielded as they come. The frames of a failed play are rejected, and all come again: more slowly if a
+    camera missed pulses, because the rate that cameras state is a bound that not all reach by wire. What worked is kept
+    in `Rig.paces_s`.
     Raises UnsupportedByDeviceError: a camera has no exposure set; FrameTimeoutError, ScanEvidenceError: the third play
     failed.
     """
@@ -220,7 +228,8 @@ def capture_by_wire(session: CaptureSession, retries: RetryPolicy) -> Iterator[S
             "write exposure_s into their tables of the rig file"
         )
     rig.projector.load(session.sequence)
-    lit_s, period_s = play_times_s(session)
+    lit_s, asked_s = play_times_s(session)
+    period_s = rig.paces_s.get((lit_s, asked_s), asked_s)
     last: dict[str, Frame] = {}
     causes: list[str] = []
     timed_out = 0
@@ -237,13 +246,13 @@ def capture_by_wire(session: CaptureSession, retries: RetryPolicy) -> Iterator[S
             play.doubts = [each for each in play.doubts if not alike(each.camera, each.suspects)]
         play.faults += map(str, play.doubts)
         if not play.faults:
+            rig.paces_s[lit_s, asked_s] = period_s
             return
         for camera in rig.cameras.values():
             camera.disarm()
         causes.append(_describe_faults(play, session.sequence))
         timed_out += play.missing == len(play.faults)
-        # Continue at half the rate; the cause names the option for the rig file.
-        period_s *= 2 if any(play.misses_every_second_pulse(name) for name in rig.cameras) else 1
+        period_s *= max(map(play.periods_apart, rig.cameras))
         retries.evidence.clear()
         for index, name in play.delivered:
             retries.refuse(RefusedFrame(index, name, number, causes[-1], delivered=True))
@@ -276,11 +285,12 @@ def play_times_s(session: CaptureSession) -> tuple[float, float]:
 def _missing_frame_fault(session: CaptureSession, play: _Play, name: str, index: int, error: FrameTimeoutError) -> str:
     """Describe a frame that did not come."""
     count = len(session.sequence)
-    if play.misses_every_second_pulse(name):
+    if (periods := play.periods_apart(name)) > 1:
         return (
-            f"camera '{name}' gave {index} of {count} frames and missed every second pulse: it cannot expose every "
-            f"{play.period_s:.6g} s; write trigger_period_s = {2 * play.period_s:.6g} into [synchronisation] of the "
-            "rig file, or shorten its exposure or its region"
+            f"camera '{name}' gave {index} of {count} frames and took every {'second' if periods == 2 else 'third'} "
+            f"pulse only: by wire it cannot expose every {play.period_s:.6g} s; write trigger_period_s = "
+            f"{periods * play.period_s:.6g} into [synchronisation] of the rig file, or shorten its "
+            "exposure or its region"
         )
     return (
         f"camera '{name}' gave {index} of {count} frames, that of {session.describe_pattern(index)} did not come "

@@ -206,7 +206,8 @@ class Rig:
     """Open devices with settings, calibration and timing. A context manager that closes all devices on exit.
 
     `synchronisation` is None if latency was not measured. `clock` is the clock of all time stamps. `positioner` is None
-    if the user moves the calibration board.
+    if the user moves the calibration board. `paces_s` : the time from pulse to pulse that worked by wire, by the time
+    that patterns were lit and the time that was tried first; kept while the rig is open.
     """
 
     name: str
@@ -218,6 +219,7 @@ class Rig:
     synchronisation: Synchronisation | None = None
     clock: Clock = field(default_factory=SystemClock)
     positioner: Positioner | None = None
+    paces_s: dict[tuple[float, float], float] = field(default_factory=dict)
 
     def truth(self) -> Truth | None:
         """Return the ground truth of a rendered scene; None for real hardware."""

@@ -8,14 +8,14 @@ import pytest
 
 from slrig.capture.latency import measure_latency
 from slrig.capture.sequencer import capture
-from slrig.devices import Rig, Synchronisation, Trigger
+from slrig.devices import Rig, Synchronisation
 from slrig.errors import FrameTimeoutError
 from slrig.model import Pixels, Size
 from slrig.patterns.sequence import encode
 from tests.contract.live_devices import Webcam, live_rig
 from tests.contract.pairing import FRAMES, wrong_pairings
 from tests.contract.stage import REFERENCE_EXPOSURE_S, Stage
-from tests.unit.capture.fake_rig import PROJECTOR, CameraFaults, Scene, fake_rig, patterns_for
+from tests.unit.capture.fake_rig import Scene, patterns_for
 
 SIZE = Size(2048, 96)
 SEQUENCE = encode(patterns_for(SIZE), SIZE)
@@ -72,20 +72,6 @@ def test_no_frame_is_paired_wrongly(fps: float, disturbed: dict[str, float], pro
     assert (result.wrong, result.examples) == (0, ())
     assert result.shot_again > 0.03 * FRAMES
     assert result.refused_scans < result.scans / 2
-
-
-def test_a_camera_that_misses_every_second_pulse_is_played_to_more_slowly() -> None:
-    missed = CameraFaults(drop=frozenset(range(1, 22, 2)))
-    wired = {"eye": frozenset({Trigger.HARDWARE})}
-    fake = fake_rig(cameras=["eye"], projector={"plays": True}, triggers=wired, faults={"eye": missed})
-    causes: list[str] = []
-    sequence = encode(patterns_for(PROJECTOR), PROJECTOR)
-    frames = list(capture(fake.rig, sequence, refused=lambda refused: causes.append(refused.cause)))
-    assert {shot.pattern for shot in frames} == set(range(len(sequence)))
-    assert causes
-    assert all("missed every second pulse" in cause and "trigger_period_s = " in cause for cause in causes)
-    first_s, second_s = (period_s for _, period_s in fake.world.periods_s)
-    assert second_s == pytest.approx(2 * first_s)
 
 
 def test_a_camera_that_gives_no_frame_ends_a_capture() -> None:

@@ -285,7 +285,9 @@ class FakeTurntable:
 
 @dataclass
 class CameraFaults:
-    """Each set holds numbers of frames, counted from 0."""
+    """Each set holds numbers of frames, counted from 0. readout_s : after each exposure the camera takes no notice of
+    pulses for so long; None: it always does.
+    """
 
     drop: frozenset[int] = frozenset()
     stale: frozenset[int] = frozenset()
@@ -296,6 +298,7 @@ class CameraFaults:
     unplug_at: int | None = None
     readback: float = 1.0
     min_period_s: float | None = None
+    readout_s: float | None = None
 
 
 @dataclass
@@ -321,6 +324,7 @@ class FakeCamera:
     white: float | None = None
     pushed_at: int | None = None
     exposures_s: list[float] = field(default_factory=list)
+    busy_until_ns: int = 0
 
     def __post_init__(self) -> None:
         self.world.on_wire.append(self._on_wire)
@@ -356,8 +360,11 @@ class FakeCamera:
         self._expose()
 
     def _on_wire(self) -> None:
-        if self.armed is Trigger.HARDWARE:
-            self._expose()
+        if self.armed is not Trigger.HARDWARE or self.world.now_ns < self.busy_until_ns:
+            return
+        self._expose()
+        if self.faults.readout_s is not None:
+            self.busy_until_ns = self.world.now_ns + round((self.exposures_s[-1] + self.faults.readout_s) * 1e9)
 
     def _expose(self) -> None:
         number, self.made = self.made, self.made + 1

@@ -578,6 +578,33 @@ def test_a_shift_shows_in_the_brightness_of_the_frames(first_column_px: float, l
     assert frame_shift([dark] * COUNT, SEQUENCE) == frame_shift([], SEQUENCE) == 0
 
 
+@pytest.mark.parametrize(
+    ("told_s", "readout_s", "times", "words"),
+    [
+        # An industrial camera that tells the rate of overlapped exposures, and takes no trigger while it reads out.
+        (0.0115, 0.0044, 2, "every second pulse"),
+        # A rolling shutter that is three times slower by wire.
+        (0.0115, 0.021, 3, "every third pulse"),
+    ],
+)
+def test_a_camera_that_misses_pulses_is_played_to_more_slowly_and_the_next_time_at_once(
+    told_s: float, readout_s: float, times: int, words: str
+) -> None:
+    run_result = CaptureRun(wired(min_period_s=told_s, readout_s=readout_s)).run()
+    run_result.assert_right()
+    period_s = f"trigger_period_s = {times * told_s:.6g}"
+    assert run_result.refused
+    assert all(words in refused.cause and period_s in refused.cause for refused in run_result.refused)
+    fake = run_result.fake
+    assert [period_s for _, period_s in fake.world.periods_s] == pytest.approx([told_s, times * told_s])
+    # Exposed for another time, it is tried anew.
+    longer = {name: CameraSettings(0.011) for name in fake.cameras}
+    for rig in (fake.rig, replace(fake.rig, settings=longer)):
+        list(capture(rig, SEQUENCE))
+    played_s = [period_s for _, period_s in fake.world.periods_s[2:]]
+    assert played_s == pytest.approx([times * told_s, *(step * told_s for step in (1, times))])
+
+
 # ---- the time from pulse to pulse
 
 
