@@ -24,6 +24,7 @@ from slrig.capture.latency import (
     measure_latency,
     stable_from_ns,
 )
+from slrig.capture.pulses import measure_trigger_period
 from slrig.capture.sequencer import capture, choose_triggers
 from slrig.capture.streaming import earliest_change_s
 from slrig.capture.triggering import SETTINGS_TOLERANCE, differs_from_request
@@ -62,6 +63,7 @@ __all__ = [
     "earliest_change_s",
     "judge_exposure",
     "measure_latency",
+    "measure_trigger_period",
     "round_to_refresh_s",
     "stable_from_ns",
 ]

@@ -29,7 +29,7 @@ _LEAST_SHIFT_NS = 500_000
 
 MAX_PLAYS = 3
 
-_SLOWER = (2, 3)
+SLOWER = (2, 3)
 """How many times slower a sequence is played to a camera that misses pulses."""
 
 _MIN_CORRELATION = 0.9  # of brightness, for a shift; few cameras are linear
@@ -208,7 +208,7 @@ class _Play:
         """
         apart_ns = np.diff(self.starts_ns.get(camera, ()))
         periods = round(float(np.median(apart_ns)) / (self.period_s * 1e9)) if len(apart_ns) > 1 else 1
-        return periods if periods in _SLOWER else 1
+        return periods if periods in SLOWER else 1
 
 
 def capture_by_wire(session: CaptureSession, retries: RetryPolicy) -> Iterator[Shot]:

@@ -11,7 +11,15 @@ from typing import Any, Self, TypeVar, cast
 import numpy as np
 
 from slrig.capture import DEFAULT_SEARCH_S, CameraLatency, LatencyMeasurement, choose_triggers, earliest_change_s
-from slrig.devices import CameraInfo, FoundDevice, ProjectorInfo, Rig, Synchronisation, UnknownPolarityProjector
+from slrig.devices import (
+    CameraInfo,
+    FoundDevice,
+    ProjectorInfo,
+    Rig,
+    Synchronisation,
+    Trigger,
+    UnknownPolarityProjector,
+)
 from slrig.doctor import timing
 from slrig.doctor.advice import (
     ExposureAdvice,
@@ -55,6 +63,7 @@ class Diagnosis:
 
     exposures : by camera. lines : lines that suit the blur better than the rig's own. synchronisation : as measured;
     None too if scans need not wait. refresh_hz : None if the display has no grid of refreshes.
+    trigger_period_s : least time between trigger pulses; None too if the cameras follow the rate that they state.
     """
 
     rig: str
@@ -65,6 +74,7 @@ class Diagnosis:
     refresh_hz: float | None
     response: ResponseCurve | None
     flickers: tuple[timing.LightFlicker, ...]
+    trigger_period_s: float | None = None
 
     @property
     def healthy(self) -> bool:
@@ -97,6 +107,7 @@ class Diagnosis:
             refresh_hz=document["refresh_hz"],
             response=None if curve is None else _restored(ResponseCurve, curve),
             flickers=tuple(_restored(timing.LightFlicker, each) for each in document["flickers"]),
+            trigger_period_s=document.get("trigger_period_s"),
         )
 
 
@@ -172,6 +183,7 @@ class _DoctorRun:
         self.refresh_hz: float | None = None
         self.curve: ResponseCurve | None = None
         self.flickers: tuple[timing.LightFlicker, ...] = ()
+        self.trigger_period_s: float | None = None
         self.is_polarity_unknown = False
         self._advice: dict[str, ExposureAdvice] = {}
         self._blurs_px: list[float] = []
@@ -188,6 +200,10 @@ class _DoctorRun:
             ("flicker", self._measure_flicker),
             ("exposure", self._advise_exposures),
         ]
+        if self.rig.projector.info.plays and all(
+            Trigger.HARDWARE in camera.info.triggers for camera in self.rig.cameras.values()
+        ):
+            checks.append(("trigger pulses", self._measure_pulses))
         for number, (stage, check) in enumerate(checks):
             self.progress(stage, number / len(checks), "")
             try:
@@ -208,7 +224,7 @@ class _DoctorRun:
         lines = advise_lines(max(blurs_px, default=math.inf), self.period_px, self.steps, sines=self.sines)
         return Diagnosis(
             self.rig.name, findings, self._advice, lines, self.synchronisation, self.refresh_hz, self.curve,
-            self.flickers,
+            self.flickers, self.trigger_period_s,
         )  # fmt: skip
 
     @property
@@ -330,6 +346,18 @@ class _DoctorRun:
             self.findings += check_refresh_multiple(light, self.refresh_hz)
             limits_s = self.rig.cameras[name].info.exposure_range_s
             self._advice[name] = advise_exposure(light, limits_s, refresh_hz=self.refresh_hz, flickers=self.flickers)
+
+    def _measure_pulses(self) -> None:
+        """Measure with the exposures that were advised, without what the rig file says of the period."""
+        settings = {
+            name: replace(each, exposure_s=self._advice[name].exposure_s) if name in self._advice else each
+            for name, each in self.rig.settings.items()
+        }
+        known = self.rig.synchronisation if self.latency is None else self.latency.synchronisation
+        known = None if known is None else replace(known, trigger_period_s=None)
+        rig = replace(self.rig, settings=settings, synchronisation=known)
+        self.trigger_period_s, findings = timing.measure_pulses(rig, self.sequence)
+        self.findings += findings
 
 
 def _describe_devices(rig: Rig, displays: Sequence[FoundDevice]) -> list[Finding]:

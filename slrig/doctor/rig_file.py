@@ -103,6 +103,9 @@ def rig_file_text(data: Mapping[str, Any], diagnosis: Diagnosis, *, source: Path
             )
             comments |= dict.fromkeys(((_SYNC, "stamp_error_s", name) for name in errors_s), stamps)
         tables[_SYNC] = table
+    if diagnosis.trigger_period_s is not None:
+        tables.setdefault(_SYNC, {})["trigger_period_s"] = round(diagnosis.trigger_period_s, 6)
+        comments[_SYNC, "trigger_period_s"] = "measured by wire: the least time between pulses that all cameras follow"
     return "\n".join([*_heading(diagnosis, source), *_table_lines(tables, (), comments)]) + "\n"
 
 

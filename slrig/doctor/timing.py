@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slrig.capture import CameraLatency, LatencyMeasurement, measure_latency
+from slrig.capture import CameraLatency, LatencyMeasurement, measure_latency, measure_trigger_period
 from slrig.devices import CameraSettings, Rig, Synchronisation
 from slrig.doctor.light import CameraSession, Finding, LightMeasurement, camera_label, fault, format_ms, note, ok
 from slrig.errors import ScanEvidenceError
@@ -179,6 +179,22 @@ def check_punctuality(rig: Rig, light: LightMeasurement, cause: ScanEvidenceErro
         "result into [synchronisation]"
     )
     return fault("timing.late", subject, message, remedy)
+
+
+def measure_pulses(rig: Rig, sequence: PatternSequence) -> tuple[float | None, list[Finding]]:
+    """Return the least period of trigger pulses that a rig file has to name, and the findings; None if scans need not
+    be told. Raises DeviceError.
+    """
+    asked_s, least_s = measure_trigger_period(rig, sequence)
+    if least_s == asked_s:
+        message = f"every camera takes a trigger pulse every {format_ms(asked_s)}, as scans send them"
+        return None, [ok("timing.pulses", "cameras", message)]
+    message = f"cameras miss trigger pulses every {format_ms(asked_s)}, as scans send them first, and take them every "
+    remedy = (
+        f"write trigger_period_s = {least_s:.6g} into [synchronisation], as in the rig file that --output writes: else "
+        "the first scan is played again, more slowly"
+    )
+    return least_s, [note("timing.pulses", "cameras", f"{message}{format_ms(least_s)}", remedy)]
 
 
 def waiting_time_s(synchronisation: Synchronisation | None) -> float:

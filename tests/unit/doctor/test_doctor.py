@@ -25,6 +25,7 @@ from slrig.doctor.measures import depth_mm_per_px
 from slrig.errors import FrameTimeoutError, ScanEvidenceError, UnsupportedByDeviceError
 from slrig.model import FloatArray, Frame, PatternSequence, Pinhole, Pixels, Size, White
 from slrig.patterns.sequence import encode, scan_patterns
+from tests.unit.capture.fake_rig import CameraFaults, fake_rig
 from tests.unit.simulated_rig.building import FACING_PLATE, head_options
 
 LAMP = {"size_px": [96, 72], "focal_px": [400.0, 400.0], "blur_px": 0.4}
@@ -407,3 +408,16 @@ def test_the_direction_of_the_current_is_found_before_all_other_checks(tmp_path:
     assert f"led_current_inverted = {str(inverted).lower()}" in found.remedy
     assert diagnosis.synchronisation is None
     assert not diagnosis.exposures
+
+
+def test_the_least_period_of_the_trigger_is_measured_where_a_camera_states_a_shorter_one() -> None:
+    readout = CameraFaults(min_period_s=0.0115, readout_s=0.0044)
+    every = {"eye": frozenset(Trigger)}
+    fake = fake_rig(cameras=["eye"], projector={"plays": True}, triggers=every, faults={"eye": readout})
+    found = run_doctor(fake.rig, search_s=0.05)
+    assert "timing.pulses" in names(found, Severity.NOTE)
+    period_s = Diagnosis.from_document(found.document()).trigger_period_s
+    assert period_s is not None
+    exposure_s = found.exposures["eye"].exposure_s
+    assert exposure_s + 0.0044 <= period_s < exposure_s + 0.0052
+    assert fake.at_rest

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -446,6 +447,13 @@ def test_the_new_file_is_the_old_one_with_the_measured_values(old: Path) -> None
         assert lines[lines.index(key) - 1].startswith(words)
     assert lines[0] == "# Written by slrig doctor, from old.toml."
     assert "# Fault, projector: light comes late, by far. Do: write it down." in lines
+
+
+def test_a_measured_period_of_the_trigger_is_written_without_a_latency(old: Path) -> None:
+    new = old.with_name("new.toml")
+    write_rig_file(replace(diagnosis(), trigger_period_s=0.01440004), old, new, force=False)
+    assert tomllib.loads(new.read_text())["synchronisation"] == {"trigger_period_s": 0.0144}
+    assert "# measured by wire" in new.read_text()
 
 
 def test_lines_that_suit_the_blur_take_the_place_of_those_there(old: Path) -> None:
