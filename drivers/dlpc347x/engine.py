@@ -9,8 +9,6 @@ number of the first pattern was added), and the kind of flash data has 4 bytes i
 from __future__ import annotations
 
 import struct
-import threading
-import time
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from enum import IntEnum
@@ -21,6 +19,8 @@ from pydantic import Field
 from drivers.dlpc347x.bus import ADDRESS, I2cBus
 from drivers.dlpc347x.flash import HEAD_BYTES, FlashedLine, block_size
 from drivers.pattern_engine.options import LedColour, LightOptions
+from drivers.pattern_engine.patience import PATIENCE_S, ask_until
+from slrig.devices import Clock, SystemClock
 from slrig.errors import DeviceError, UnsupportedByDeviceError
 
 
@@ -84,14 +84,13 @@ SEQUENCE_FAULTS = {
     6: "the order has too few entries",
 }
 """By number in bits 19 to 23 of the system status."""
-READY_TIMEOUT_S, ERASE_TIMEOUT_S = 1.0, 20.0
+ERASE_TIMEOUT_S = 20.0
 MAX_READ_BYTES, MAX_WRITE_BYTES = 256, 256
 """Bytes of flash in one transfer: up to 256 can be read and 1024 written; adapters on USB take fewer."""
 PATTERN_DATA = bytes([0xD0, 0, 0, 0])
 """The kind of flash data ("entire sensing pattern data", dlpc347x.h)."""
 _ENTRY = struct.Struct("<BBBQIIIB")
 _INTERNAL_MODE, _INTERNAL = 4, 1
-_ASK_AGAIN_S = 0.005
 
 
 class Dlpc347xCommand(IntEnum):
@@ -159,11 +158,14 @@ class OrderEntry:
 
 
 class Dlpc347xEngine:
-    """The controller behind a bus. Every method raises the bus's DeviceError and DeviceGoneError."""
+    """The controller behind a bus. Every method raises the bus's DeviceError and DeviceGoneError.
 
-    def __init__(self, bus: I2cBus) -> None:
+    clock : the rig's; default: the system's.
+    """
+
+    def __init__(self, bus: I2cBus, clock: Clock | None) -> None:
         self._bus = bus
-        self._never = threading.Event()
+        self._clock = clock or SystemClock()
         self._repeats = 0
 
     @property
@@ -192,16 +194,21 @@ class Dlpc347xEngine:
     def settle(
         self, command: Dlpc347xCommand, data: bytes, query: bytes = b"", *, expected: bytes | None = None
     ) -> None:
-        """Set a value and read it back. query : parameters of the read; expected : its answer, if it differs from
-        `data`. Raises UnsupportedByDeviceError if another value is read back.
+        """Set a value and read it back until it agrees. query : parameters of the read; expected : its answer, if it
+        differs from `data`. Raises UnsupportedByDeviceError if it never agrees.
         """
         wanted = data if expected is None else expected
         self.send(command, data)
-        got = self._bus.read(command + 1, len(wanted), query)
+        self._require(command.name.lower().replace("_", " "), command, wanted, query)
+
+    def _require(self, name: str, command: Dlpc347xCommand, wanted: bytes, query: bytes) -> None:
+        got = ask_until(self._clock, lambda: self._bus.read(command + 1, len(wanted), query), wanted.__eq__)
         if got != wanted:
-            name = command.name.lower().replace("_", " ")
-            message = f"{self.name}: requested {name} {wanted.hex(' ')}, the engine gives {got.hex(' ')}; "
-            raise UnsupportedByDeviceError(message + "switch it off and on, and update its firmware to TI's latest")
+            message = (
+                f"{self.name}: requested {name} {wanted.hex(' ')}, the engine gives {got.hex(' ')} after "
+                f"{PATIENCE_S:g} s; switch it off and on, and update its firmware to TI's latest"
+            )
+            raise UnsupportedByDeviceError(message)
 
     def wait_until_initialised(self, timeout_s: float) -> None:
         """Wait until the main program takes commands, and clear earlier errors."""
@@ -252,21 +259,24 @@ class Dlpc347xEngine:
         for number, entry in enumerate(entries):
             self.send(Dlpc347xCommand.ORDER, bytes([number == 0]) + entry.encoded)
         for number, entry in enumerate(entries):
-            got = self._bus.read(Dlpc347xCommand.ORDER + 1, _ENTRY.size, bytes([number]))
-            if got != entry.encoded:
-                message = f"{self.name}: entry {number} was {entry.encoded.hex(' ')}, the engine gives {got.hex(' ')}"
-                raise UnsupportedByDeviceError(message + "; update its firmware to TI's latest")
+            self._require(f"entry {number} of the order", Dlpc347xCommand.ORDER, entry.encoded, bytes([number]))
         self._repeats = repeats
-        until = time.monotonic() + READY_TIMEOUT_S
-        while (state := self._bus.read(Dlpc347xRead.STATE, 7))[0] != 1 or state[1] != len(entries):
-            if time.monotonic() > until:
-                message = f"{self.name} is not ready for {len(entries)} entries, its state is {state.hex(' ')}"
-                raise DeviceError(message + "; switch it off and on, and write its flash: slrig patterns RIG")
-            self._never.wait(_ASK_AGAIN_S)
+        ready = bytes([1, len(entries)])
+        state = ask_until(
+            self._clock, lambda: self._bus.read(Dlpc347xRead.STATE, 7), lambda state: state.startswith(ready)
+        )
+        if not state.startswith(ready):
+            message = f"{self.name} is not ready for {len(entries)} entries, its state is {state.hex(' ')}"
+            raise DeviceError(message + "; switch it off and on, and write its flash: slrig patterns RIG")
 
     def switch_leds(self, *, by_sequence: bool) -> None:
         """Let the sequence switch the LEDs, or switch them all off; verify by reading back."""
         self.settle(Dlpc347xCommand.LED_ENABLE, bytes([7 if by_sequence else 0]))
+
+    def restart(self) -> None:
+        """Stop the order, and start it from its beginning."""
+        self.stop()
+        self.start()
 
     def start(self) -> None:
         """Start the order."""
@@ -320,12 +330,10 @@ class Dlpc347xEngine:
         return self._bus.read(Dlpc347xRead.SHORT, 1)[0]
 
     def _wait(self, mask: int, wanted: int, timeout_s: float, action: str) -> None:
-        until = time.monotonic() + timeout_s
-        while (short := self._short_status()) & mask != wanted:
-            if time.monotonic() > until:
-                message = f"{self.name} did not {action} in {timeout_s:g} s (status {short:#04x}); switch it off and on"
-                raise DeviceError(message)
-            self._never.wait(_ASK_AGAIN_S)
+        short = ask_until(self._clock, self._short_status, lambda short: short & mask == wanted, timeout_s)
+        if short & mask != wanted:
+            message = f"{self.name} did not {action} in {timeout_s:g} s (status {short:#04x}); switch it off and on"
+            raise DeviceError(message)
 
     def _system_fault(self, short: int) -> DeviceError:
         system = int.from_bytes(self._bus.read(Dlpc347xRead.SYSTEM, 4), "little")

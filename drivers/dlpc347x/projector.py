@@ -50,7 +50,7 @@ class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
     """
 
     def __init__(self, bus: I2cBus, options: Dlpc347xEngineOptions, *, clock: Clock | None = None) -> None:
-        super().__init__(Dlpc347xEngine(bus), options, clock=clock)
+        super().__init__(Dlpc347xEngine(bus, clock), options, clock=clock)
         self._options = options
         self._lines: LineEncoder
         self._available: Mapping[PatternLine, tuple[FlashedLine, ...]] = {}

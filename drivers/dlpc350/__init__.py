@@ -13,14 +13,20 @@ Geometry. The mirrors are rotated by 45°. Column c of row r is at x = c + ½·(
 diagonal (10.8 µm). A column's edge zigzags by half a column from row to row, and its centre is at c + ¼ for every
 column. A calibration for 912 x 1140 pixels accounts for this: its fy is twice its fx, and its cx is shifted by ¼.
 
-Sequences. Commands are sent in the order stop, set, validate, start. `play` shows the loaded sequence once, with a
-pulse on TRIG_OUT_1 per pattern. `show` plays a sequence of one pattern, which ends by itself within 2 s; while this
-program lives, it restarts it, for at most `hold_s`. Dark means: sequence stopped and every LED off.
+Sequences. Commands are sent in the order stop, set, validate, start, with the waits of TI's programs
+(`drivers.pattern_engine.patience`). `play` shows the loaded sequence once, with a pulse on TRIG_OUT_1 per pattern.
+`show` plays a sequence of one pattern, which ends by itself within 2 s; while this program lives, it restarts it, for
+at most `hold_s`. Dark means: sequence stopped and every LED off.
 
-Speed. A show takes a dozen commands of some 3 ms, and the loading time of a picture from the flash: 200 ms at worst,
-less for simple pictures; TI's program shows it. The engine's buffer holds two pictures, and a running sequence repeats
-from there without loading (DLPU011, "Pattern Sequence Background"). It is not documented whether this holds for a start
-after a stop; it is assumed to load, unless the rig file says otherwise (`image_kept_s`).
+Tables. All patterns of a sequence have the same times, so the table without times of their own is used (trigger mode
+1), as in TI's demonstration of the controller (main.c, `Demo_PatternSequenceLegacy`). TI's DLP SDK uses the other one
+(mode 3, commands 0x1A3E to 0x1A40), which holds more patterns, and serves no purpose here. Public programs use either.
+
+Speed. A show takes a dozen commands of some 3 ms, 20 ms of waits if the table changes, and the loading time of a
+picture from the flash: 200 ms at worst, less for simple pictures; TI's program shows it. The engine's buffer holds two
+pictures, and a running sequence repeats from there without loading (DLPU011, "Pattern Sequence Background"). It is not
+documented whether this holds for a start after a stop; it is assumed to load, unless the rig file says otherwise
+(`image_kept_s`).
 
 LED current. TI's own sources for the LightCrafter 4500 (lcr4500.cpp in the DLP SDK) send 255 minus the current; the
 manual has it the other way round. 5 % with the wrong polarity is 95 %. Until the rig file gives the polarity, the

@@ -23,7 +23,7 @@ TI's own sources (`DLPC350_SendImageLut`, "special case of 2 entries").
 from __future__ import annotations
 
 import struct
-import time
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -34,8 +34,10 @@ from pydantic import Field
 
 from drivers.dlpc350.flash import FlashedPlane
 from drivers.pattern_engine.options import LedColour, UsbLightOptions
+from drivers.pattern_engine.patience import PATIENCE_S, ask_until
 from drivers.pattern_engine.projector import Timing, check_duty, light_duration_us
-from drivers.pattern_engine.usb import UsbCommand, UsbEngine
+from drivers.pattern_engine.usb import UsbCommand, UsbEngine, UsbLink
+from slrig.devices import Clock
 from slrig.errors import UnsupportedByDeviceError
 
 
@@ -92,6 +94,12 @@ VALIDATION_FAULTS = {
     16: "exposure and period differ by less than 230 µs",
 }
 _BUSY = 0x80
+_STOP_AGAIN_S = 0.1
+PAUSE_S = 0.01
+"""From the command to validate until the first look at its result, and from the result until the start. The register of
+the result says "not busy" before the engine begins."""
+_FIRST_PAUSE_S = 0.1
+"""The first of these after the engine was opened."""
 _EDGE_NS = 107.2
 _EDGE_ZERO = 0xBB
 _EDGES = (0, 0xD5)
@@ -206,6 +214,18 @@ class Dlpc350Command(IntEnum):
 class Dlpc350Engine(UsbEngine):
     """A DLPC350 behind a link."""
 
+    def __init__(self, link: UsbLink, clock: Clock | None) -> None:
+        super().__init__(link, clock)
+        self._pause_s = _FIRST_PAUSE_S
+
+    def wait_until_stopped(self) -> None:
+        """See `UsbEngine`. Repeats the stop. Raises DeviceError if the sequence does not end."""
+        for _ in range(round(PATIENCE_S / _STOP_AGAIN_S)):
+            if ask_until(self._clock, lambda: self.byte(UsbCommand.START_STOP) == 0, bool, _STOP_AGAIN_S):
+                return
+            self.stop()
+        raise self._late("stop the sequence")
+
     def set_trigger_out(self, *, active_low: bool, delay_us: float) -> None:
         """Set TRIG_OUT_1: polarity, and delay of its edges after the pattern's light, in steps of 107.2 ns."""
         edge = min(max(_EDGE_ZERO + round(delay_us * 1e3 / _EDGE_NS), _EDGES[0]), _EDGES[1])
@@ -236,17 +256,25 @@ class Dlpc350Engine(UsbEngine):
             self.set_byte(Dlpc350Command.MAILBOX, 0)
 
     def validate(self, timeout_s: float) -> None:
-        """Let the engine validate the sequence. Raises UnsupportedByDeviceError with the faults found; DeviceError on
-        time-out.
+        """Let the engine validate the sequence; it can be started then. Raises UnsupportedByDeviceError with the faults
+        found; DeviceError on time-out.
         """
         self.set_byte(Dlpc350Command.VALIDATE, 0)
-        until = time.monotonic() + timeout_s
-        while (found := self.byte(Dlpc350Command.VALIDATE)) & _BUSY:
-            self._wait(until, "finish the validation of the sequence")
+        self._wait(self._pause_s)
+        self._pause_s = PAUSE_S
+        found = ask_until(
+            self._clock, lambda: self.byte(Dlpc350Command.VALIDATE), lambda found: not found & _BUSY, timeout_s
+        )
+        if found & _BUSY:
+            raise self._late("finish the validation of the sequence")
         if found:
             causes = "; ".join(text for bit, text in VALIDATION_FAULTS.items() if found & bit) or f"status {found:#04x}"
             message = f"{self.name} refuses the sequence: {causes}; report this message to the driver's maintainer"
             raise UnsupportedByDeviceError(message)
+        self._wait(PAUSE_S)
+
+    def _wait(self, seconds: float) -> None:
+        self._clock.wait_until(self._clock.now_ns() + round(seconds * 1e9), threading.Event())
 
     def firmware_tag(self) -> str:
         """Return the tag of the flash contents, at most 32 characters."""

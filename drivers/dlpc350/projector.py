@@ -5,6 +5,7 @@ from __future__ import annotations
 from drivers.dlpc350.engine import (
     DARK_US,
     MAX_PATTERNS,
+    PAUSE_S,
     Dlpc350Command,
     Dlpc350Engine,
     Dlpc350EngineOptions,
@@ -31,6 +32,7 @@ from slrig.model import PatternSequence
 
 DLPC350 = UsbController("dlpc350", 0x6401, "3.0")
 VALIDATION_TIMEOUT_S = 5.0
+_PATTERN_MODE = 1
 _POLLABLE_US = 1_000_000
 """A sequence of at least this length still runs when the engine is polled."""
 
@@ -52,7 +54,7 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
         serial: str = "",
         clock: Clock | None = None,
     ) -> None:
-        super().__init__(Dlpc350Engine(link), options, clock=clock)
+        super().__init__(Dlpc350Engine(link, clock), options, clock=clock)
         self._options = options
         self._flash = flash
         self._serial = serial
@@ -126,12 +128,14 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
         with self._lock:
             self._state.require_open()
             try:
-                self.blank()
+                self._stop_for_settings()
                 previous, self._last_sent = self._last_sent, None
-                if previous is None or previous[0] != timing:
-                    engine.set_timing(timing)
-                engine.set_tables(tables, None if previous is None else previous[1])
-                engine.validate(VALIDATION_TIMEOUT_S)
+                # What is validated and unchanged can be started again, as in TI's DLP SDK (`StartPatternSequence`).
+                if previous != (timing, tables):
+                    if previous is None or previous[0] != timing:
+                        engine.set_timing(timing)
+                    engine.set_tables(tables, None if previous is None else previous[1])
+                    engine.validate(VALIDATION_TIMEOUT_S)
                 started_ns = self._clock.now_ns()
                 engine.switch_leds(by_sequence=True)
                 engine.start()
@@ -148,20 +152,18 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
     def _prepare(self) -> ProjectorInfo:
         engine, options = self._engine, self._options
         self._check_flash()
-        engine.settle_byte(UsbCommand.DISPLAY_MODE, 1)
+        self._enter_mode(_PATTERN_MODE)
         engine.settle_byte(Dlpc350Command.PATTERN_SOURCE, 3)
         engine.settle_byte(Dlpc350Command.TRIGGER_MODE, 1)
         self._configure_leds()
         engine.set_trigger_out(active_low=options.trigger_polarity == "low", delay_us=options.trigger_delay_us)
-        # A change of mode may start the engine's default sequence.
-        self.blank()
         return ProjectorInfo(
             name="projector",
             model="DLPC350 light engine",
             serial=self._serial,
             size=MIRRORS,
             plays=not self.is_polarity_unknown,
-            latency_s=options.load_s(same_picture=True) + COMMANDS_S,
+            latency_s=options.load_s(same_picture=True) + COMMANDS_S + 2 * PAUSE_S,
             gap_s=options.light_margin_s,
             duty=options.duty_limit,
             lights=options.colour is LedColour.WHITE,

@@ -25,7 +25,8 @@ follow the LED enables.
 
 To be checked on hardware: whether LEDs come on at a start after LED enables were off (a user of a DLP9000 reported that
 they did not, at firmware 5), what is lit after the end of a played sequence, light between a stop and a start (a held
-pattern may blink once a second), the byte order of a pixel (frames show it), and the delay of the light (`start_s`).
+pattern may blink once a second), whether the status says that a sequence has ended, the byte order of a pixel (frames
+show it), and the delay of the light (`start_s`).
 
 Not used. Standby: waking within two minutes is forbidden (table 2-35). The mirrors' idle mode: LEDs were reported on in
 it. Video input, patterns from flash, more than one bit per pattern, TRIG_IN, blocks of mirrors.

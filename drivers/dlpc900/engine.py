@@ -34,8 +34,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.pattern_engine.options import UsbLightOptions
+from drivers.pattern_engine.patience import ask_until
 from drivers.pattern_engine.projector import Plane, Timing, check_duty, light_duration_us, pattern_plane, plane_keys
-from drivers.pattern_engine.usb import CommandRefusedError, UsbCommand, UsbEngine
+from drivers.pattern_engine.usb import CommandRefusedError, MainStatus, UsbCommand, UsbEngine, UsbLink
+from slrig.devices import Clock
 from slrig.errors import DeviceError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 
@@ -155,9 +157,6 @@ TRIGGER_DELAY_RANGE_US = (-20, 20_000)
 _CLEARED = 1
 ON_THE_FLY = 3
 """Display mode: pictures are sent over USB (DLPU018 table 2-97)."""
-MODE_CHANGE_S = 0.6
-"""Longest time of a change of mode. The guide states 0.3 s for another change, in which the previous mode may be read
-(table 2-97); this is twice that."""
 MAX_MESSAGE_BYTES = 504
 """Picture bytes in one message (DLPU018 table 5-3)."""
 SECOND_READY, INCOMPATIBLE = 16, 2
@@ -259,6 +258,10 @@ def encode_definition(index: int, place: MemoryPlane, *, exposure_us: int, dark_
 class Dlpc900Engine(UsbEngine):
     """A DLPC900 behind a link."""
 
+    def __init__(self, link: UsbLink, clock: Clock | None) -> None:
+        super().__init__(link, clock)
+        self._reports_stop = True
+
     def version(self) -> tuple[int, int]:
         """Return major and minor number of its firmware."""
         answer = self._link.read(Dlpc900Command.VERSION, 4)
@@ -304,6 +307,16 @@ class Dlpc900Engine(UsbEngine):
                 piece = part[start : start + MAX_MESSAGE_BYTES]
                 self._link.send(data, struct.pack("<H", len(piece)) + piece)
                 self._check_error_code(f"take picture {number}")
+
+    def wait_until_stopped(self) -> None:
+        """See `UsbEngine`. 0x1A24 cannot be read here, the guide names the status instead (DLPU018, "Pattern Display
+        Start/Stop"). Goes on if that does not change, and waits no more then: what it says without a sequence is not
+        documented. What a running sequence refuses is an error with the engine's own reason.
+        """
+        if self._reports_stop:
+            self._reports_stop = ask_until(
+                self._clock, lambda: not self.byte(UsbCommand.MAIN_STATUS) & MainStatus.RUNNING, bool
+            )
 
     def faults(self) -> str:
         """Return the faults in the hardware status as text; empty if none."""

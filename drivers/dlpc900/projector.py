@@ -5,7 +5,6 @@ shown.
 from __future__ import annotations
 
 from drivers.dlpc900.engine import (
-    MODE_CHANGE_S,
     ON_THE_FLY,
     SECOND_READY,
     Dlpc900Engine,
@@ -50,7 +49,7 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
     def __init__(
         self, link: UsbLink, options: Dlpc900EngineOptions, *, serial: str = "", clock: Clock | None = None
     ) -> None:
-        super().__init__(Dlpc900Engine(link), options, clock=clock)
+        super().__init__(Dlpc900Engine(link, clock), options, clock=clock)
         self._options = options
         self._serial = serial
         self._mirrors: Dlpc900Mirrors
@@ -64,7 +63,7 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
         """See `Projector`. Sends the patterns, some 10 kB for 24 of them, at no more than 64 kB a second."""
         self._state.require_open()
         self._state.loaded = None
-        self.blank()
+        self._stop_for_settings()
         self._state.require_size(sequence, self._mirrors.size)
         memory = pack_sequence(sequence)
         columns = self._mirrors.size.width_px // self._mirrors.controllers
@@ -98,7 +97,7 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
             self._state.require_open()
             last = len(self._places) - 1
             try:
-                self.blank()
+                self._stop_for_settings()
                 self._define(index, Timing(exposure_us, exposure_us))
                 self._define(last, Timing(dark_us, dark_us))
                 self._engine.configure(len(self._places), len(self._places))
@@ -127,7 +126,7 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
         with self._lock:
             self._state.require_open()
             try:
-                self.blank()
+                self._stop_for_settings()
                 patterns = len(self._places) - 1
                 for index in range(patterns):
                     self._define(index, timing)
@@ -168,9 +167,7 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
             message = f"{engine.name}: a {mirrors.name} has two controllers, the second one does not answer; "
             message += "switch it off and on"
             raise DeviceError(message)
-        engine.settle_byte(UsbCommand.DISPLAY_MODE, ON_THE_FLY, within_s=MODE_CHANGE_S)
-        # A change of mode may start the engine's default sequence.
-        self.blank()
+        self._enter_mode(ON_THE_FLY)
         self._configure_leds()
         engine.set_trigger_out(active_low=options.trigger_polarity == "low", delay_us=options.trigger_delay_us)
         return ProjectorInfo(

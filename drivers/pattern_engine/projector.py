@@ -123,14 +123,14 @@ EngineT = TypeVar("EngineT", bound=UsbEngine)
 
 
 class LightSource(Protocol):
-    """Light control of an engine. `start` restarts the sequence that was set last."""
+    """Light control of an engine."""
 
     def switch_leds(self, *, by_sequence: bool) -> None:
         """Let the sequence switch the LEDs, or switch them all off."""
         ...
 
-    def start(self) -> None:
-        """Start the current sequence."""
+    def restart(self) -> None:
+        """Stop the current sequence, and start it again."""
         ...
 
     def stop(self) -> None:
@@ -229,19 +229,25 @@ class EngineProjector(ABC, Generic[SourceT]):
             self._clock.wait_until(self._clock.now_ns() + round(MAX_UNATTENDED_S * 1e9 / 20), self._state.closed)
             if self._state.closed.is_set():
                 return
-            with self._lock:
-                now_s = self._now_s()
-                if now_s >= self._dark_at_s:
-                    self._darken()
-                if not self._next_restart_s <= now_s < self._held_until_s:
-                    continue
-                self._next_restart_s = now_s + self._restart_interval_s
+            # Another call that has the lock changes the light; it may wait for the engine.
+            if self._lock.acquire(blocking=False):
                 try:
-                    self._engine.stop()
-                    self._engine.start()
-                except SlrigError:
-                    # The next call of the user reports it; until then the engine goes dark by itself.
-                    self._held_until_s = 0.0
+                    self._hold()
+                finally:
+                    self._lock.release()
+
+    def _hold(self) -> None:
+        now_s = self._now_s()
+        if now_s >= self._dark_at_s:
+            self._darken()
+        if not self._next_restart_s <= now_s < self._held_until_s:
+            return
+        self._next_restart_s = now_s + self._restart_interval_s
+        try:
+            self._engine.restart()
+        except SlrigError:
+            # The next call of the user reports it; until then the engine goes dark by itself.
+            self._held_until_s = 0.0
 
     def _darken(self) -> list[SlrigError]:
         """Switch the LEDs off, then stop; try both even if one fails. Return the errors."""
@@ -291,7 +297,7 @@ class UsbEngineProjector(EngineProjector[EngineT], ABC):
             raise UnsupportedByDeviceError(message)
         with self._lock:
             self._state.require_open()
-            self.blank()
+            self._stop_for_settings()
             self._engine.set_led_registers(bytes([round(share * 255)] * 3))
 
     def polarity_option(self, *, rises: bool) -> str:
@@ -309,6 +315,17 @@ class UsbEngineProjector(EngineProjector[EngineT], ABC):
                     raise fault
         self._engine.wait_until_initialised(WAKE_TIMEOUT_S)
         self.blank()
+
+    def _enter_mode(self, mode: int) -> None:
+        """Set the display mode, unless it is set. A change of mode may start the engine's default sequence: stop it."""
+        if self._engine.byte(UsbCommand.DISPLAY_MODE) != mode:
+            self._engine.settle_byte(UsbCommand.DISPLAY_MODE, mode)
+        self._stop_for_settings()
+
+    def _stop_for_settings(self) -> None:
+        """Darken the engine, and wait until it takes settings."""
+        self.blank()
+        self._engine.wait_until_stopped()
 
     def _configure_leds(self) -> None:
         """Reset mirroring and inversion, and set the LED current: half of it if its polarity is unknown."""

@@ -30,6 +30,7 @@ import select
 import struct
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass
@@ -37,7 +38,8 @@ from enum import IntEnum, IntFlag
 from pathlib import Path
 
 from drivers.linux import require_linux
-from slrig.devices import FoundDevice
+from drivers.pattern_engine.patience import PATIENCE_S, ask_until
+from slrig.devices import Clock, FoundDevice, SystemClock
 from slrig.errors import (
     ConfigError,
     DeviceBusyError,
@@ -53,7 +55,7 @@ READ, ANSWER, FAILED = 0x80, 0x40, 0x20
 MAX_DATA = 512 - HEADER
 """Message buffer of the engine: 512 bytes (DLPU018 §1.2)."""
 
-ANSWER_TIMEOUT_S = 1.0
+ANSWER_TIMEOUT_S = 2.0
 _RAW_INFO = 0x8008_4803
 """HIDIOCGRAWINFO: bus type, vendor, product (include/uapi/linux/hidraw.h)."""
 
@@ -63,7 +65,6 @@ TI = 0x0451
 _GONE = {errno.EIO, errno.ENODEV, errno.ENXIO, errno.EPIPE, errno.ESHUTDOWN, errno.ECONNRESET}
 SYSFS = Path("/sys/class/hidraw")
 DEV = Path("/dev")
-_ASK_AGAIN_S = 0.005
 
 
 @dataclass(frozen=True, slots=True)
@@ -412,12 +413,15 @@ FAULTS = {
 }
 
 
-class UsbEngine:
-    """The controller behind a link. Every method raises the link's DeviceError and DeviceGoneError."""
+class UsbEngine(ABC):
+    """The controller behind a link. Every method raises the link's DeviceError and DeviceGoneError.
 
-    def __init__(self, link: UsbLink) -> None:
+    clock : the rig's; default: the system's.
+    """
+
+    def __init__(self, link: UsbLink, clock: Clock | None) -> None:
         self._link = link
-        self._never = threading.Event()
+        self._clock = clock or SystemClock()
 
     @property
     def name(self) -> str:
@@ -436,20 +440,21 @@ class UsbEngine:
         """Return a register of one byte."""
         return self._link.read(command, 1)[0]
 
-    def settle_byte(self, command: IntEnum, value: int, *, within_s: float = 0.0) -> None:
+    def settle_byte(self, command: IntEnum, value: int) -> None:
         """Set a register of one byte and read it back. Raises UnsupportedByDeviceError if it differs."""
-        self.settle(command, bytes([value]), within_s=within_s)
+        self.settle(command, bytes([value]))
 
-    def settle(self, command: IntEnum, data: bytes, *, within_s: float = 0.0) -> None:
-        """Set a register and read it back within a time. Raises UnsupportedByDeviceError if it differs."""
+    def settle(self, command: IntEnum, data: bytes) -> None:
+        """Set a register and read it back until it agrees. Raises UnsupportedByDeviceError if it never does."""
         self._link.write(command, data)
-        until = time.monotonic() + within_s
-        while (got := self._link.read(command, len(data))[: len(data)]) != data and time.monotonic() < until:
-            self._never.wait(_ASK_AGAIN_S)
+        got = ask_until(self._clock, lambda: self._link.read(command, len(data))[: len(data)], data.__eq__)
         if got != data:
             name = command.name.lower().replace("_", " ")
-            message = f"{self.name}: requested {name} {data.hex(' ')}, the engine gives {got.hex(' ')}; "
-            message += f"switch it off and on, and update its firmware to {self._link.kind.firmware} or later"
+            message = (
+                f"{self.name}: requested {name} {data.hex(' ')}, the engine gives {got.hex(' ')} after "
+                f"{PATIENCE_S:g} s; switch it off and on, and update its firmware to "
+                f"{self._link.kind.firmware} or later"
+            )
             raise UnsupportedByDeviceError(message)
 
     def switch_leds(self, *, by_sequence: bool) -> None:
@@ -474,33 +479,40 @@ class UsbEngine:
         self.settle(UsbCommand.LED_CURRENT, values)
 
     def start(self) -> None:
-        """Start the current sequence from its beginning."""
+        """Start the current sequence from its beginning. It is stopped."""
         self.set_byte(UsbCommand.START_STOP, 2)
 
     def stop(self) -> None:
-        """Stop the sequence."""
+        """Stop the sequence. It may take a while to end: `wait_until_stopped`."""
         self.set_byte(UsbCommand.START_STOP, 0)
+
+    def restart(self) -> None:
+        """Stop the current sequence, and start it from its beginning."""
+        self.stop()
+        self.wait_until_stopped()
+        self.start()
+
+    @abstractmethod
+    def wait_until_stopped(self) -> None:
+        """Wait until a stopped sequence has ended: until then, settings may be refused. In pattern modes only."""
 
     def wait_until_running(self, timeout_s: float) -> None:
         """Wait until the sequencer runs. Raises DeviceError on time-out."""
-        until = time.monotonic() + timeout_s
-        while not self.byte(UsbCommand.MAIN_STATUS) & MainStatus.RUNNING:
-            self._wait(until, "start the sequence")
+        self._wait_for(UsbCommand.MAIN_STATUS, MainStatus.RUNNING, timeout_s, "start the sequence")
 
     def wait_until_initialised(self, timeout_s: float) -> None:
         """Wait until the engine is ready for commands. Raises DeviceError on time-out."""
-        until = time.monotonic() + timeout_s
-        while not self.byte(UsbCommand.HARDWARE_STATUS) & HardwareStatus.INITIALISED:
-            self._wait(until, "finish its initialisation")
+        self._wait_for(UsbCommand.HARDWARE_STATUS, HardwareStatus.INITIALISED, timeout_s, "finish its initialisation")
 
     def faults(self) -> str:
         """Return the faults in the hardware status as text; empty if none."""
         status = self.byte(UsbCommand.HARDWARE_STATUS)
         return "; ".join(text for bit, text in FAULTS.items() if status & bit)
 
-    def _wait(self, until: float, action: str) -> None:
-        if time.monotonic() > until:
-            status = self.faults() or "no fault"
-            message = f"{self.name} did not {action} in time, and reports: {status}; switch it off and on"
-            raise DeviceError(message)
-        self._never.wait(_ASK_AGAIN_S)
+    def _wait_for(self, command: UsbCommand, bit: int, timeout_s: float, action: str) -> None:
+        if not ask_until(self._clock, lambda: self.byte(command) & bit, bool, timeout_s):
+            raise self._late(action)
+
+    def _late(self, action: str) -> DeviceError:
+        status = self.faults() or "no fault"
+        return DeviceError(f"{self.name} did not {action} in time, and reports: {status}; switch it off and on")

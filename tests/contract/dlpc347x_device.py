@@ -55,7 +55,6 @@ class Fake347x(Sequencer):
         clock: Clock | None = None,
     ) -> None:
         super().__init__(clock)
-        self.bent: dict[int, bytes] = {}
         self.gone = False
         self.registers = {0x05: b"\0", 0x50: b"\1", 0x52: b"\7", 0x54: struct.pack("<3H", 900, 900, 900), 0x90: b"\1"}
         self.triggers = {0: struct.pack("<Bi", 1, 0), 1: struct.pack("<Bi", 0, 0)}

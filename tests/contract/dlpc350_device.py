@@ -1,7 +1,8 @@
 """A DLPC350 at the other end of the wire: what the controller does with reports, as TI's documents say, and strictly.
 
-It wakes up in video mode with every LED on; a stop leaves the last pattern lit; settings are refused while a sequence
-runs, and a start before the tables were validated; light comes only when the picture was loaded.
+It wakes up in video mode with every LED on and the sequencer running; a stop leaves the last pattern lit; settings are
+refused while a sequence runs, and a start before the tables were validated; light comes only when the picture was
+loaded. It takes its time where TI's own programs wait: `Times`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import cv2
@@ -48,29 +49,56 @@ _INVALIDATES = {0x1A1B, 0x1A1D, 0x1A22, 0x1A23, 0x1A29, 0x1A30, 0x1A31, 0x1A34}
 
 @dataclass
 class Faults:
-    """What goes wrong. silent, refused : commands that are not answered, or refused; bent : registers that read back
-    otherwise than they were set; busy_checks : how often a check of the tables is said to be still under way.
-    """
+    """What goes wrong. silent, refused : commands that are not answered, or refused."""
 
     silent: set[int] = field(default_factory=set)
     refused: set[int] = field(default_factory=set)
-    bent: Mapping[int, bytes] = field(default_factory=dict)
-    busy_checks: int = 2
-    never_runs: bool = False
     stale_answer: bool = False
 
 
+@dataclass
+class Times:
+    """How long an engine takes, s. TI's programs wait 0.1 to 1.1 s for a mode and for a stop, 0.11 s and longer for a
+    check, and look at the status 0.01 s after a start.
+
+    mode : until it is in the mode that it was told; until then it says the one before, and takes no patterns. stop :
+    until a sequence ends that was told to stop; until then it goes on, and nothing can be set or started. check : until
+    the tables are checked; it says "busy" from `check_begins` on, and before that what the last check found. start :
+    until the sequencer runs.
+    """
+
+    mode: float = 0.0
+    stop: float = 0.0
+    check_begins: float = 0.0
+    check: float = 0.0
+    start: float = 0.0
+
+
 class Sequencer(ABC):
-    """What fake engines have in common: a light, and a thread that plays. It wakes up with the light on."""
+    """What fake engines have in common: a light, and a thread that plays. It wakes up with the light on. bent :
+    registers that read back otherwise than they were set.
+    """
 
     def __init__(self, clock: Clock | None) -> None:
         self.commands: list[tuple[int, bytes]] = []
+        self.bent: dict[int, bytes] = {}
         self.shown: list[Pixels | None] = []
         self.lit: Pixels | None = None
         self._clock = clock or SystemClock()
         self._mirrors: Pixels | None = WHITE
         self._halt: threading.Event | None = None
         self._lock = threading.RLock()
+
+    def _after(self, seconds: float, act: Callable[[], object]) -> None:
+        """Do it at once, or on a thread when the time has come."""
+
+        def wait() -> None:
+            self._clock.wait_until(due_ns, threading.Event())
+            with self._lock:
+                act()
+
+        due_ns = self._clock.now_ns() + round(seconds * 1e9)
+        threading.Thread(target=wait, name=SEQUENCER, daemon=True).start() if seconds else act()
 
     @property
     def running(self) -> bool:
@@ -115,9 +143,12 @@ class FakeEngine(Sequencer):
 
     light, pulse : called at every change of light (None: dark), and at every edge of the trigger output (ns). load_s :
     how long a picture takes from the flash. keeps : whether a start takes it from the buffer where it is still there;
-    TI's documents say nothing of it. clock : the one that its sequencer runs by. led_inverted : whether light falls as
-    the registers of the currents rise; None: it is full unless all of them are 255.
+    TI's documents say nothing of it. times : how long it takes for all else. clock : the one that its sequencer runs
+    by. led_inverted : whether light falls as the registers of the currents rise; None: it is full unless all of them
+    are 255.
     """
+
+    _PATTERN_MODE = b"\1"
 
     def __init__(
         self,
@@ -129,11 +160,13 @@ class FakeEngine(Sequencer):
         load_s: float = 0.0,
         standby: bool = False,
         keeps: bool = False,
+        times: Times | None = None,
         led_inverted: bool | None = None,
         clock: Clock | None = None,
     ) -> None:
         super().__init__(clock)
         self.faults = Faults()
+        self.times = times or Times()
         self.tag = tag
         self.registers: dict[int, bytes] = {
             **{command: bytes(length) for command, length in (_SETTINGS | _AT_ANY_TIME).items()},
@@ -147,9 +180,10 @@ class FakeEngine(Sequencer):
         self._keeps, self._led_inverted = keeps, led_inverted
         self._buffered: list[int] = []
         self._mailboxes = {1: bytearray(64), 2: bytearray(128 * 3)}
-        self._validated: int | None = None
+        self._action = b"\0"
+        self._stopping = False
+        self._checked, self._validated = 0, False
         self._hardware = 1
-        self._busy = 0
         self._pending: tuple[bytearray, int] | None = None
         self._relight()
 
@@ -179,34 +213,41 @@ class FakeEngine(Sequencer):
         """The answer to a command; None: refused."""
         if self.registers[0x0200] == b"\1" and command not in {0x0200, 0x1A0A}:
             return None
-        return self._told(command) if read else self._set(command, data)
+        if read:
+            return self.bent.get(command) or self._told(command)
+        return self._set(command, data)
 
     def _told(self, command: int) -> bytes | None:
         match command:
             case 0x1A0A:
                 return bytes([self._hardware])
             case 0x1A0C:
-                return bytes([2 if self.running and not self.faults.never_runs else 0])
+                # Video is shown by the sequencer, too.
+                return bytes([2 if self.running or self.registers[0x1A1B] == b"\0" else 0])
             case 0x1A1A:
-                self._busy = max(self._busy - 1, 0)
-                return b"\x80" if self._busy else bytes([self._validated or 0])
+                return bytes([self._checked])
             case 0x1A24:
-                return bytes([2 if self.running else 0])
+                return self._action
             case 0x1A42:
                 return bytes([len(self._planes)])
             case 0x1AFF:
                 return self.tag.encode().ljust(32, b"\0")
-        return self.faults.bent.get(command, self.registers.get(command))
+        return self.registers.get(command)
 
     def _set(self, command: int, data: bytes) -> bytes | None:
         if command == 0x1A24:
             return self._started(data)
-        if self.running and (command in _SETTINGS or command in {0x1A1A, 0x1A34}):
+        of_patterns = command in {0x1A1A, 0x1A33, 0x1A34}
+        in_pattern_mode = self.registers[0x1A1B] == self._PATTERN_MODE
+        if (of_patterns and not in_pattern_mode) or (self.running and (command in _SETTINGS or of_patterns)):
             return None
         if command in _INVALIDATES:
-            self._validated = None
+            self._validated = False
         if command == 0x1A1A:
-            self._validated, self._busy = self._validation(), self.faults.busy_checks
+            self._after(self.times.check_begins, partial(self._check, 0x80))
+            self._after(self.times.check_begins + self.times.check, lambda: self._check(self._validation()))
+        elif command == 0x1A1B and len(data) == 1:
+            self._after(self.times.mode, partial(self._enter, data))
         elif command == 0x1A34:
             box = self._mailboxes.get(self.registers[0x1A33][0])
             start = self.registers[0x1A32][0]
@@ -220,14 +261,34 @@ class FakeEngine(Sequencer):
             return None
         return b""
 
+    def _enter(self, mode: bytes) -> None:
+        self.registers[0x1A1B] = mode
+
+    def _check(self, found: int) -> None:
+        self._checked, self._validated = found, found == 0
+
     def _started(self, data: bytes) -> bytes | None:
         if data == b"\0":
-            self._stop()
-        elif data == b"\2" and self._validated == 0 and self.registers[0x1A1B] == b"\1" and not self.running:
-            self._play(self._run)
+            if not self._stopping:
+                self._stopping = True
+                self._after(self.times.stop if self.running else 0.0, self._stopped)
+        elif data == b"\2" and not self.running and self.registers[0x1A1B] == self._PATTERN_MODE and self._is_set():
+            self._action = data
+            self._after(self.times.start, lambda: self._begin() if self._action == data and not self.running else None)
         else:
             return None
         return b""
+
+    def _is_set(self) -> bool:
+        """Whether there is a sequence to begin."""
+        return self._validated
+
+    def _begin(self) -> None:
+        self._play(self._run)
+
+    def _stopped(self) -> None:
+        self._stop()
+        self._action, self._stopping = b"\0", False
 
     def _entries(self) -> list[int]:
         count = self.registers[0x1A31][0] + 1

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import struct
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.devices import Clock
 from slrig.model import Pixels, Size
 from tests.contract.dlpc350_device import FakeEngine, profile_of, repeated
 
@@ -40,18 +40,10 @@ class Fake900(FakeEngine):
     others as `FakeEngine` has them.
     """
 
-    def __init__(
-        self,
-        *,
-        light: Callable[[Pixels | None], object] = lambda _: None,
-        pulse: Callable[[int], None] = lambda _: None,
-        mirrors: int = 1,
-        version: tuple[int, int] = (6, 1),
-        standby: bool = False,
-        led_inverted: bool | None = None,
-        clock: Clock | None = None,
-    ) -> None:
-        super().__init__({}, light=light, pulse=pulse, standby=standby, led_inverted=led_inverted, clock=clock)
+    _PATTERN_MODE = b"\3"
+
+    def __init__(self, *, mirrors: int = 1, version: tuple[int, int] = (6, 1), **usual: Any) -> None:
+        super().__init__({}, **usual)
         for command, length in (_SETTINGS | _ANY_TIME).items():
             self.registers.setdefault(command, bytes(length))
         self.registers |= {0x1A1D: bytes(5), 0x1A1B: b"\1"}
@@ -82,10 +74,8 @@ class Fake900(FakeEngine):
                 return bytes([self.mirrors]) + b"out of the box".ljust(32, b"\0")
             case 0x1A0A:
                 return bytes([self._hardware | (16 if self.second_ready else 0)])
-            case 0x1A1B:
-                return self.faults.bent.get(command, self.registers[command])
-        # These are the other controller's.
-        return None if command in {0x1A1A, 0x1A42, 0x1AFF, 0x1A22, 0x1A23, 0x1A29} else super()._told(command)
+        # These are the other controller's, and starting and stopping cannot be read.
+        return None if command in {0x1A1A, 0x1A24, 0x1A42, 0x1AFF, 0x1A22, 0x1A23, 0x1A29} else super()._told(command)
 
     def _set(self, command: int, data: bytes) -> bytes | None:
         if command in _PATTERN_COMMANDS:
@@ -96,8 +86,7 @@ class Fake900(FakeEngine):
         if command == 0x1A24:
             return self._started(data)
         if command == 0x1A1B and len(data) == 1 and not self.running:
-            self.registers[command] = data
-            self._halves.clear()
+            self._after(self.times.mode, partial(self._enter, data))
             return b""
         if len(data) != (_SETTINGS | _ANY_TIME).get(command) or (self.running and command in _SETTINGS):
             self.error = 5 if self.running else 6
@@ -111,7 +100,7 @@ class Fake900(FakeEngine):
 
     def _pattern_command(self, command: int, data: bytes) -> int:
         """Do it, and return the error code."""
-        if self.running or self.registers[0x1A1B] != b"\3":
+        if self.running or self.registers[0x1A1B] != self._PATTERN_MODE:
             return 5
         match command:
             case 0x1A34:
@@ -189,21 +178,25 @@ class Fake900(FakeEngine):
             self._pictures[entry.picture] = repeated(np.hstack(halves))
         return profile_of(self._pictures[entry.picture] >> np.uint32(entry.plane) & np.uint32(1))
 
+    def _enter(self, mode: bytes) -> None:
+        super()._enter(mode)
+        self._halves.clear()
+
     def _started(self, data: bytes) -> bytes | None:
-        if data == b"\0":
-            self._stop()
-            return b""
+        answer = super()._started(data)
+        self.error = 5 if answer is None else 0
+        return answer
+
+    def _is_set(self) -> bool:
         halves = 1 if self.mirrors == 1 else 2
         needed = {(half, self._effective[index].picture) for index in self._order for half in range(halves)}
-        if data != b"\2" or self.running or not self._order or needed - self._halves.keys():
-            self.error = 5
-            return None
-        shown = self._shown_of_order or 2**32
+        return bool(self._order) and not needed - self._halves.keys()
+
+    def _begin(self) -> None:
         steps = [self._effective[index] for index in self._order]
         for step in steps:
             self._profile(step)
-        self._play(self._show, steps, shown)
-        return b""
+        self._play(self._show, steps, self._shown_of_order or 2**32)
 
     def _show(self, halt: threading.Event, steps: list[_Entry], shown: int) -> bool:
         triggered = False

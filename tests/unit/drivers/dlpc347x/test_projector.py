@@ -163,7 +163,7 @@ def test_a_flash_that_has_no_room_or_forgets_is_reported(worn: bool) -> None:
         ({"entry_bytes": 23}, {}, UnsupportedByDeviceError, "98h .*more or fewer parameters in its firmware: update"),
         ({"most_entries": 0}, {}, UnsupportedByDeviceError, "refuses the sequence: the order has too few entries"),
         ({}, {0x51: b"\1"}, UnsupportedByDeviceError, "requested led control 00, the engine gives 01"),
-        ({}, {0x99: b""}, UnsupportedByDeviceError, "entry 0 was 00 01 04"),
+        ({}, {0x99: b""}, UnsupportedByDeviceError, "requested entry 0 of the order 00 01 04"),
         ({}, {0x9F: bytes(7)}, DeviceError, "is not ready for 1 entries"),
         ({}, {0x53: b"\7"}, UnsupportedByDeviceError, "requested led enable 00, the engine gives 07"),
         ({}, {0xD0: b"\x89", 0xD1: b"\0\x10\4\0"}, DeviceError, "reports: the green LED failed; its supply is low"),
@@ -174,9 +174,7 @@ def test_what_the_engine_does_not_take_or_gives_back_otherwise_is_reported_and_i
     bent: dict[int, bytes],
     error: type[DeviceError],
     told: str,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("drivers.dlpc347x.engine.READY_TIMEOUT_S", 0.02)
     bench = Bench(**engine)
     bench.engine.bent = bent
     with pytest.raises(error, match=told):

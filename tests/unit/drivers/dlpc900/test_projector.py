@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from typing import Any
 
 import numpy as np
 import pytest
@@ -93,19 +92,14 @@ def test_what_is_not_known_is_refused_and_left_dark(version: tuple[int, int], mi
     assert bench.engine.lit is None
 
 
-def test_a_mode_that_the_engine_reports_later_is_waited_for(bench: Bench) -> None:
-    class Late(dict[int, bytes]):
-        """Says for a while that it is in the mode before."""
-
-        asked = 0
-
-        def get(self, command: int, default: Any = None) -> Any:
-            self.asked += command == 0x1A1B
-            return b"\1" if command == 0x1A1B and self.asked < 4 else default
-
-    bench.engine.faults.bent = late = Late()
-    bench.open().close()
-    assert late.asked == 4
+def test_an_engine_that_never_says_that_it_has_stopped_is_waited_for_once(bench: Bench) -> None:
+    bench.engine.bent = {0x1A0C: b"\2"}
+    projector = bench.loaded()
+    for index in (0, 2):
+        begun_ns = bench.clock.now_ns()
+        projector.show(index)
+        assert bench.shows(SEQUENCE.profiles[index])
+        assert bench.clock.now_ns() - begun_ns == 20_000_000
 
 
 def test_what_the_engine_refuses_is_reported_in_its_words_and_it_is_dark(bench: Bench) -> None:

@@ -107,7 +107,7 @@ def test_a_refusal_and_a_silent_engine_are_reported_and_it_may_come_back(engine:
         link.read(0x1A0C, 1)
     engine.faults.silent.clear()
     link._answer_s = 5.0
-    assert link.read(0x1A0C, 1) == b"\0"
+    assert link.read(0x1A0C, 1) == b"\2"
 
 
 def test_an_unplugged_engine_is_gone_and_a_closed_link_is_closed() -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import struct
 import threading
-from collections.abc import Callable
+from collections import ChainMap
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 from slrig.devices import UnknownPolarityProjector
 from slrig.errors import DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Size
-from tests.contract.dlpc350_device import WHITE
+from tests.contract.dlpc350_device import WHITE, Times
 from tests.unit.drivers.pattern_engine.engine_bench import BENCHES, LEDS, START_STOP, Bench, UsbBench
 
 MakesBench = Callable[..., Bench]
@@ -52,7 +53,9 @@ def usb_bench(made: MakesBench) -> UsbBench:
 def test_an_engine_that_shines_is_dark_once_it_is_open(made: MakesBench, size: Size, registers: dict[int, int]) -> None:
     bench = made(flashed=None) if size == Size(1280, 720) else made()
     assert bench.engine.shown == [WHITE]
+    begun_ns = bench.clock.now_ns()
     projector = bench.open()
+    assert bench.clock.now_ns() == begun_ns, "an engine that answers at once is not waited for"
     assert bench.engine.shown[-1] is None
     assert bench.engine.commands[0] == bench.leds[:2], "the first thing that it was told"
     assert {key: bench.engine.registers[key][0] for key in registers} == registers
@@ -198,6 +201,73 @@ def test_closing_from_another_thread_ends_a_wait_for_light(bench: Bench, monkeyp
     assert bench.engine.lit is None
 
 
+# Engines that take their time.
+
+
+@pytest.mark.parametrize(
+    ("made", "command", "before"),
+    [
+        ("dlpc347x", 0x06, b"\0"),
+        ("dlpc347x", 0x55, bytes(6)),
+        ("dlpc347x", 0x99, bytes(24)),
+        ("dlpc350", 0x1A1B, b"\0"),
+        ("dlpc350", 0x0B01, bytes(3)),
+        ("dlpc350", 0x1A29, bytes(8)),
+        ("dlpc900", 0x1A1B, b"\1"),
+        ("dlpc900", 0x1A1D, b"\1" * 5),
+    ],
+    indirect=["made"],
+)
+def test_what_reads_as_before_for_a_while_is_asked_again(bench: Bench, command: int, before: bytes) -> None:
+    bench.engine.bent = bent = {command: before}
+    bench.clock.call_at(bench.clock.now_ns() + 900_000_000, bent.clear)
+    bench.loaded().show(0)
+    assert bench.shows(bench.sequence.profiles[0])
+
+
+LATE: tuple[dict[str, float], ...] = ({"mode": 0.15}, {"stop": 0.1}, {"start": 0.2})
+CHECK = {"check_begins": 0.009, "check": 0.3}
+
+
+@pytest.mark.parametrize(
+    ("made", "late"),
+    [(kind, late) for kind in ("dlpc350", "dlpc900") for late in (*LATE, ChainMap(*LATE))]
+    + [("dlpc350", CHECK), ("dlpc350", ChainMap(CHECK, *LATE))],
+    indirect=["made"],
+)
+def test_an_engine_that_takes_its_time_opens_shows_and_plays(made: MakesBench, late: Mapping[str, float]) -> None:
+    bench = made(times=Times(**late))
+    for _ in range(2):
+        projector = bench.loaded()
+        for index in (0, 2, 1, 0):
+            projector.show(index)
+            assert bench.shows(bench.sequence.profiles[index])
+        bench.clock.advance(10)
+        assert bench.shows(bench.sequence.profiles[0]), "it is started again while it is held"
+        bench.pulses.clear()
+        projector.play(0.003, 0.01)
+        bench.clock.advance(1)
+        assert len(bench.pulses) == 3
+        # The next host finds it as this one left it: in its mode, and showing.
+        projector.show(2)
+        bench.died(projector)
+    assert bench.clock.now_ns() < 40e9
+
+
+@pytest.mark.parametrize(
+    ("made", "told"),
+    [("dlpc350", "did not stop the sequence in time"), ("dlpc900", "did not take definition .* not in this mode")],
+    indirect=["made"],
+)
+def test_a_sequence_that_never_ends_is_an_error_and_dark(usb_bench: UsbBench, told: str) -> None:
+    projector = usb_bench.loaded()
+    projector.show(0)
+    usb_bench.engine.times.stop = 1e6
+    with pytest.raises(DeviceError, match=told):
+        projector.show(2)
+    assert usb_bench.engine.lit is None
+
+
 # Engines with a USB port.
 
 
@@ -252,16 +322,19 @@ def test_the_trigger_output_is_set(usb_bench: UsbBench, options: dict[str, Any],
     ("command", "got", "words"),
     [
         (0x0B01, bytes(3), r"requested led current .. .. .., the engine gives 00 00 00"),
-        (0x1A1B, b"\0", r"requested display mode 0., the engine gives 00"),
+        (
+            0x1A1B,
+            b"\0",
+            r"display mode 0., the engine gives 00 after 1 s; switch it off and on, and update its firmware",
+        ),
         (0x1008, b"\1", "requested flip long 00, the engine gives 01"),
     ],
 )
 def test_a_setting_that_the_engine_bends_is_refused_and_it_is_dark(
-    usb_bench: UsbBench, command: int, got: bytes, words: str, monkeypatch: pytest.MonkeyPatch
+    usb_bench: UsbBench, command: int, got: bytes, words: str
 ) -> None:
-    monkeypatch.setattr("drivers.dlpc900.projector.MODE_CHANGE_S", 0.02)
     usb_bench.engine.registers[0x0B01] = b"\1\1\1"
-    usb_bench.engine.faults.bent = {command: got}
+    usb_bench.engine.bent = {command: got}
     with pytest.raises(UnsupportedByDeviceError, match=words):
         usb_bench.open()
     assert usb_bench.engine.lit is None
