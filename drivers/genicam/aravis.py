@@ -17,6 +17,7 @@ from functools import lru_cache
 from typing import Any
 
 from drivers.genicam.connection import GenICamConnection, GenicamOptions, GenICamStream, RawFrame, RawImage
+from drivers.genicam.link import find_forbidden
 from slrig.devices import FoundDevice
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, LibraryMissingError, UnsupportedByDeviceError
 from slrig.model import Size
@@ -138,8 +139,6 @@ class AravisConnection(GenICamConnection):
         self._handler = self._device.connect("control-lost", lambda *_: lost.set())
         try:
             self._require_control(options.device)
-            if self._is_gige:
-                self._prepare_network(aravis, options)
         except BaseException:
             self.close()
             raise
@@ -187,6 +186,11 @@ class AravisConnection(GenICamConnection):
             return None
 
     @property
+    def is_usb(self) -> bool:
+        """See `GenICamConnection`."""
+        return bool(self._camera.is_uv_device())
+
+    @property
     def has_stamps(self) -> bool:
         """See `GenICamConnection`."""
         return not self._is_gige or self._device.get_timestamp_tick_frequency() > 0
@@ -228,7 +232,11 @@ class AravisConnection(GenICamConnection):
             )
             raise DeviceBusyError(message)
 
-    def _prepare_network(self, aravis: Any, options: GenicamOptions) -> None:
+    def prepare_link(self) -> None:
+        """See `GenICamConnection`."""
+        if not self._is_gige:
+            return
+        aravis, options = load_aravis().aravis, self._options
         kind = aravis.GvStreamOption
         with self.access("setting up the network") as camera:
             camera.gv_set_stream_options(kind.NONE if options.packet_socket else kind.PACKET_SOCKET_DISABLED)
@@ -289,31 +297,12 @@ def _open_device(aravis: Any, name: str, device: str) -> Any:
         with translate_aravis_errors(name, f"opening {device}"):
             return aravis.Camera.new(device)
     except DeviceGoneError as error:
-        known = ", ".join(label for _, label in list_aravis_cameras()) or "none"
+        known = ", ".join(each.label for each in find_devices())
         message = (
-            f"camera '{name}': no GenICam camera '{device}' answers; found: {known}. Check cable, power, and that its "
-            "IP address is in the network of this machine's card"
+            f"camera '{name}': no GenICam camera '{device}' answers; found: {known or 'none'}. Check cable, power, and "
+            "that its IP address is in the network of this machine's card"
         )
         raise DeviceGoneError(message) from error
-
-
-def list_aravis_cameras() -> tuple[tuple[str, str], ...]:
-    """Return id and label of every camera that answers, without opening any. Aravis takes about one second."""
-    aravis = load_aravis().aravis
-    aravis.update_device_list()
-    found = []
-    for index in range(aravis.get_n_devices()):
-        protocol = aravis.get_device_protocol(index)
-        if protocol in PROTOCOLS:
-            identity = aravis.get_device_id(index)
-            parts = (
-                aravis.get_device_vendor(index),
-                aravis.get_device_model(index),
-                aravis.get_device_serial_nbr(index),
-            )
-            where = aravis.get_device_address(index)
-            found.append((identity, f"{' '.join(filter(None, parts))} ({protocol}, {where}): {identity}"))
-    return tuple(sorted(found))
 
 
 def _arrival_ns(buffer: Any) -> int:
@@ -338,5 +327,22 @@ def _read_clocks() -> tuple[int, int]:
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
-    """List every GigE Vision and USB3 Vision camera that answers Aravis. Opens none. Raises LibraryMissingError."""
-    return tuple(FoundDevice("genicam", identity, label) for identity, label in list_aravis_cameras())
+    """List every GigE Vision and USB3 Vision camera that answers Aravis, which takes about one second, and those that
+    this user may not open. Opens none. Raises LibraryMissingError.
+    """
+    aravis = load_aravis().aravis
+    aravis.update_device_list()
+    found = []
+    for index in range(aravis.get_n_devices()):
+        protocol = aravis.get_device_protocol(index)
+        if protocol in PROTOCOLS:
+            identity = aravis.get_device_id(index)
+            parts = (
+                aravis.get_device_vendor(index),
+                aravis.get_device_model(index),
+                aravis.get_device_serial_nbr(index),
+            )
+            where = aravis.get_device_address(index)
+            label = f"{' '.join(filter(None, parts))} ({protocol}, {where}): {identity}"
+            found.append(FoundDevice("genicam", identity, label))
+    return (*sorted(found, key=lambda device: device.device), *find_forbidden())

@@ -28,11 +28,11 @@ from drivers.genicam.connection import (
     GenICamStream,
     GentlOptions,
     RawFrame,
-    SensorRegion,
     differs,
 )
 from drivers.genicam.gentl import GentlConnection
 from drivers.genicam.pixels import FORMATS, PfncFormat, decode_pixels
+from drivers.genicam.setup import set_trigger, set_up_camera
 from drivers.genicam.timing import Arrival, FrameNumbers, Interval, StartClock, TriggeredStarts, UntriggeredStarts
 from slrig.bundle import validate
 from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, Trigger
@@ -42,13 +42,6 @@ from slrig.model import CameraFormat, Frame, Pixels, Size
 _SLICE_S = 0.05
 _LATCHES = 5
 _TIE_AGAIN_NS = 5_000_000_000
-
-
-_SELECTOR = "TriggerSelector"
-_START_SELECTORS = ("FrameStart", "ExposureStart")
-"""Selectors that start one frame; IDS cameras (uEye+) have the latter only. For one exposure per frame they are
-equivalent."""
-_AUTOMATIC = ("ExposureAuto", "GainAuto", "BlackLevelAuto", "BalanceWhiteAuto", "GammaAuto")
 _RESEND_AFTER_NS = 400_000_000
 _DRAIN_MARGIN_S = 0.2
 _MAX_BUFFER_BYTES = 1 << 30
@@ -245,112 +238,6 @@ class Acquisition:
             self._clock.latch(latches)
 
 
-def set_up_camera(connection: GenICamConnection, options: GenICamCameraOptions) -> Size:
-    """Stop the camera, switch automatic functions off, set format, region and features. Return the image size.
-
-    Raises UnsupportedByDeviceError if the camera does not accept a value, or changes it.
-    """
-    features = connection.features
-    with connection.access("stopping it") as camera:
-        # Another program may have left it running, with locked settings.
-        camera.stop_acquisition()
-    if options.pixel_format not in FORMATS:
-        message = (
-            f"camera '{connection.name}': requested pixel_format {options.pixel_format}, the driver reads "
-            f"{', '.join(FORMATS)}; choose one that the camera offers: {', '.join(features.choices('PixelFormat'))}"
-        )
-        raise UnsupportedByDeviceError(message)
-    features.choose("PixelFormat", options.pixel_format)
-    for automatic in _AUTOMATIC:
-        if features.has(automatic) and "Off" in features.choices(automatic):
-            features.choose(automatic, "Off")
-    if features.has("ExposureMode"):
-        features.choose("ExposureMode", "Timed")
-    if features.has("AcquisitionMode"):
-        features.choose("AcquisitionMode", "Continuous")
-    # These may include binning, which limits the region.
-    for feature, value in options.features.items():
-        features.set_any(feature, value)
-    return _set_region(connection, options)
-
-
-def _set_region(connection: GenICamConnection, options: GenICamCameraOptions) -> Size:
-    features = connection.features
-    # The offsets limit the size: reset them first, set them last.
-    for offset in ("OffsetX", "OffsetY"):
-        if features.has(offset):
-            features.set_integer(offset, 0)
-    with connection.access("reading its size") as camera:
-        width_px, height_px = int(camera.get_width_bounds()[1]), int(camera.get_height_bounds()[1])
-    region = options.region
-    if region is None:
-        region = SensorRegion(width_px=width_px, height_px=height_px)
-    if region.x_px + region.width_px > width_px or region.y_px + region.height_px > height_px:
-        message = (
-            f"camera '{connection.name}': requested a region of {region.width_px} x {region.height_px} px at "
-            f"column {region.x_px}, row {region.y_px}; its image is {width_px} x {height_px} px; choose a part of it"
-        )
-        raise UnsupportedByDeviceError(message)
-    features.set_integer("Width", region.width_px)
-    features.set_integer("Height", region.height_px)
-    for offset, value in (("OffsetX", region.x_px), ("OffsetY", region.y_px)):
-        if value:
-            features.set_integer(offset, value)
-    return Size(region.width_px, region.height_px)
-
-
-def choose_trigger_line(connection: GenICamConnection, options: GenICamCameraOptions) -> str | None:
-    """Return the input of the hardware trigger; None if the camera has none. Raises UnsupportedByDeviceError if it does
-    not have the requested line.
-    """
-    features = connection.features
-    if features.has(_SELECTOR):
-        features.choose(_SELECTOR, _start_selector(features.choices(_SELECTOR)))
-    lines = (
-        tuple(source for source in features.choices("TriggerSource") if source.startswith("Line"))
-        if (features.has("TriggerSource"))
-        else ()
-    )
-    if options.trigger_line is None:
-        return lines[0] if lines else None
-    if options.trigger_line not in lines:
-        message = (
-            f"camera '{connection.name}': requested trigger_line {options.trigger_line}, it offers "
-            f"{', '.join(lines) or 'none'}; choose one of these, or leave it out"
-        )
-        raise UnsupportedByDeviceError(message)
-    return options.trigger_line
-
-
-def set_trigger(connection: GenICamConnection, source: str | None, options: GenICamCameraOptions) -> None:
-    """Let `source` start every exposure; None lets the camera run freely. Raises UnsupportedByDeviceError if it is not
-    accepted.
-    """
-    features = connection.features
-    selectors = features.choices(_SELECTOR) if features.has(_SELECTOR) else ()
-    start = _start_selector(selectors)
-    for selector in selectors:
-        if selector != start:
-            features.choose(_SELECTOR, selector)
-            if features.has("TriggerMode"):
-                features.choose("TriggerMode", "Off")
-    if selectors:
-        features.choose(_SELECTOR, start)
-    if source is None:
-        if features.has("TriggerMode"):
-            features.choose("TriggerMode", "Off")
-        return
-    features.choose("TriggerMode", "On")
-    features.choose("TriggerSource", source)
-    if source != "Software" and features.has("TriggerActivation"):
-        features.choose("TriggerActivation", options.trigger_activation)
-
-
-def _start_selector(selectors: tuple[str, ...]) -> str:
-    """Return the selector that starts a frame; the standard one if none is available."""
-    return next((each for each in _START_SELECTORS if each in selectors), _START_SELECTORS[0])
-
-
 class GenicamCamera:
     """Implements `slrig.devices.Camera`. connection : the open device; this camera closes it.
 
@@ -365,8 +252,7 @@ class GenicamCamera:
         self._session: Acquisition
         self._answer_pending = False
         try:
-            self._size = set_up_camera(self._connection, options)
-            self._line = choose_trigger_line(self._connection, options)
+            self._setup = set_up_camera(self._connection, options)
             self._info = self._read_info()
             self._rate_feature = next(
                 (each for each in _FRAME_RATE_FEATURES if self._connection.features.has(each)), None
@@ -406,10 +292,10 @@ class GenicamCamera:
         """See `Camera`. Opens a new stream, so no frame of an earlier arming can arrive."""
         self._require_connected()
         self._state.check_arming(count, trigger, self._info)
-        source = {Trigger.FREE: None, Trigger.SOFTWARE: "Software", Trigger.HARDWARE: self._line}[trigger]
+        source = {Trigger.FREE: None, Trigger.SOFTWARE: "Software", Trigger.HARDWARE: self._setup.line}[trigger]
         set_trigger(self._connection, source, self._options)
         self._applied = self._read_settings()
-        session = Acquisition(self._connection, self._options, FORMATS[self._options.pixel_format], self._size)
+        session = Acquisition(self._connection, self._options, FORMATS[self._options.pixel_format], self._setup.size)
         session.begin(trigger, self._applied, _MIN_BUFFERS if trigger is Trigger.FREE else self._buffers(count))
         self._session = session
         self._state.armed = trigger
@@ -461,17 +347,18 @@ class GenicamCamera:
         triggers = {Trigger.FREE}
         if software:
             triggers.add(Trigger.SOFTWARE)
-        if self._line is not None:
+        if self._setup.line is not None:
             triggers.add(Trigger.HARDWARE)
         return CameraInfo(
             name=self._name,
             model=model,
             serial=serial,
-            format=CameraFormat(self._size, FORMATS[self._options.pixel_format].bit_depth),
+            format=CameraFormat(self._setup.size, FORMATS[self._options.pixel_format].bit_depth),
             triggers=frozenset(triggers),
             exposure_range_s=(max(least_us, 1.0) / 1e6, most_us / 1e6),
             gain_range=(float(gains[0]), float(gains[1])),
             colour=bool(FORMATS[self._options.pixel_format].mosaic),
+            notes=self._setup.notes,
         )
 
     def _read_settings(self) -> AppliedSettings:

@@ -82,8 +82,13 @@ class GenICamCameraOptions(Strict, use_attribute_docstrings=True):
     trigger_activation: str = Field(default="RisingEdge", min_length=1)
     """Edge of a hardware trigger, by its GenICam name."""
 
+    user_set: str | None = Field(default=None, min_length=1)
+    """Stored settings of the camera that are loaded first, by their GenICam name (Default, UserSet1); default: none is
+    loaded."""
+
     features: Mapping[str, bool | int | float | str] = Field(default_factory=dict)
-    """Further GenICam features, set in this order when the camera is opened, and read back."""
+    """Further GenICam features, set in this order when the camera is opened, and read back. Gamma, sharpening, binning,
+    mirroring and limits of the frame rate are off before: name what enables a feature first."""
 
     time_stamp: StampMeaning = "exposure"
     """Instant that the camera's time stamps mean: "exposure" is some instant within it, "none" ignores them (for
@@ -140,6 +145,8 @@ class GentlOptions(GenICamCameraOptions, use_attribute_docstrings=True):
     """The vendor's GenTL producer, a .cti file, relative to the rig file's folder; default: all in the folders of the
     variable GENICAM_GENTL64_PATH."""
 
+
+_READ = ("boolean", "integer", "float")
 
 TOLERANCE = 0.01
 """Allowed relative difference of a number from the requested one: cameras round to their steps."""
@@ -217,6 +224,31 @@ class Features:
         with self._access(feature) as camera:
             camera.set_integer(feature, value)
         self._require_equal(feature, value, self.integer(feature))
+
+    def neutralise(self, feature: str, number: int) -> None:
+        """Switch a feature off; if it is a number, set the nearest to `number` that it takes. Raises as `set_any`."""
+        got = self.value(feature)
+        wanted: bool | float | str
+        match got:
+            case bool():
+                wanted = False
+            case str():
+                wanted = "Off"
+            case _:
+                kind = "integer" if isinstance(got, int) else "float"
+                with self._access(feature) as camera:
+                    least, most = getattr(camera, f"get_{kind}_bounds")(feature)
+                wanted = type(got)(min(max(number, least), most))
+        # Some cameras offer a single, read-only value.
+        if got != wanted:
+            self.set_any(feature, wanted)
+
+    def value(self, feature: str) -> bool | int | float | str:
+        """Return the value of a feature of any type."""
+        kind = self._feature_type(feature).lower()
+        with self._access(feature) as camera:
+            value: bool | int | float | str = getattr(camera, f"get_{kind if kind in _READ else 'string'}")(feature)
+        return bool(value) if kind == "boolean" else value
 
     def set_any(self, feature: str, value: bool | int | float | str) -> None:
         """Set a feature of any type. Raises UnsupportedByDeviceError if it is missing, of another type, or not
@@ -377,6 +409,15 @@ class GenICamConnection(ABC):
     @abstractmethod
     def feature_type(self, feature: str) -> str:
         """Return Boolean, Enumeration, String, Integer, Float, or the library's own name of the type of a feature."""
+
+    @abstractmethod
+    def prepare_link(self) -> None:
+        """Set up what carries the frames."""
+
+    @property
+    @abstractmethod
+    def is_usb(self) -> bool:
+        """True if the device is on USB."""
 
     @abstractmethod
     def start(self, buffers: int) -> GenICamStream:

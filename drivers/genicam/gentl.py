@@ -41,6 +41,7 @@ _loaded: dict[Path, GentlProducer] = {}
 _lock = threading.Lock()
 EXPOSURE_US = ("ExposureTime", "ExposureTimeAbs")
 GAIN = ("Gain", "GainAbs", "GainRaw")
+_USB = ("U3V", "USB3Vision")
 _KINDS = ("Boolean", "Enumeration", "String", "Integer", "Float", "Command", "Register", "Category")
 _LOOK_S = 0.001
 _ASK_S = 1e-5
@@ -351,6 +352,14 @@ class GentlConnection(GenICamConnection):
         """See `GenICamConnection`."""
         with self.access(f"feature {feature}") as camera:
             return feature_type(camera.node(feature))
+
+    def prepare_link(self) -> None:
+        """See `GenICamConnection`. The producer has done that."""
+
+    @property
+    def is_usb(self) -> bool:
+        """See `GenICamConnection`."""
+        return device_field(self._acquirer.device, "tl_type") in _USB
 
     def start(self, buffers: int) -> GenICamStream:
         """See `GenICamConnection`. The producer's queue is emptied when an acquisition ends."""

@@ -11,7 +11,7 @@ import subprocess
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from ctypes import c_char_p, c_int32, c_size_t, c_uint32, c_uint64, c_void_p
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -254,7 +254,14 @@ class FakeProducer:
         return f"slrig-memory-{self.camera.serial}"
 
     def _DevGetInfo(self, handle: int, what: int, *into: int) -> None:
-        text = {0: self._identity, 1: "Slrig", 2: "Memory", 3: "Custom", 4: "Memory camera", 7: self.camera.serial}
+        text = {
+            0: self._identity,
+            1: "Slrig",
+            2: "Memory",
+            3: self.camera.link,
+            4: "Memory camera",
+            7: self.camera.serial,
+        }
         _tell({each: (_TEXT, told) for each, told in text.items()} | {5: (_I32, 1)}, what, into)
 
     def _DevClose(self, handle: int) -> None:
@@ -384,7 +391,22 @@ REGISTERS = {
     "Gain": (0x150, "d"),
     "ResultingFrameRate": (0x158, "d"),
     "ReverseX": (0x160, "I"),
+    "TriggerActivation": (0x164, "I"),
+    "TriggerOverlap": (0x168, "I"),
+    "GammaEnable": (0x16C, "I"),
+    "LUTEnable": (0x170, "I"),
+    "LineSelector": (0x174, "I"),
+    "UserSetSelector": (0x178, "I"),
+    "UserSetLoad": (0x17C, "I"),
     "DeviceUserID": (0x180, "16s"),
+    "TriggerDelay": (0x190, "d"),
+    "SharpnessEnhancement": (0x198, "d"),
+    "NoiseReduction": (0x1A0, "d"),
+    "BlackLevel": (0x1A8, "d"),
+    "LineDebouncerTime": (0x1B0, "d"),
+    "BinningHorizontal": (0x1B8, "I"),
+    "DeviceLinkThroughputLimit": (0x1BC, "I"),
+    "GevSCPSPacketSize": (0x1C0, "I"),
 }
 _BY_ADDRESS = {address: (name, code) for name, (address, code) in REGISTERS.items()}
 _ENUMERATIONS = {
@@ -394,10 +416,21 @@ _ENUMERATIONS = {
     "TriggerMode": {"Off": 0, "On": 1},
     "TriggerSource": {"Software": 0, "Line1": 1},
     "ExposureAuto": {"Off": 0, "Continuous": 1},
+    "TriggerActivation": {"RisingEdge": 0, "FallingEdge": 1},
+    "TriggerOverlap": {"Off": 0, "ReadOut": 1, "PreviousFrame": 2},
+    "LineSelector": {"Line0": 0, "Line1": 1},
+    "UserSetSelector": {"Default": 0, "UserSet1": 1},
 }
-_RANGES = {"Width": (8, 640, 4), "Height": (8, 480, 2), "ExposureTime": (20.0, 1e6), "Gain": (1.0, 16.0)}
-_COMMANDS = ("AcquisitionStart", "AcquisitionStop", "TriggerSoftware", "TimestampLatch")
-_READ_ONLY = ("PayloadSize", "TimestampLatchValue", "ResultingFrameRate")
+_RANGES = {
+    **{"Width": (8, 640, 4), "Height": (8, 480, 2), "ExposureTime": (20.0, 1e6), "Gain": (1.0, 16.0)},
+    **{"TriggerDelay": (29.0, 1e6), "SharpnessEnhancement": (1.0, 4.0), "BinningHorizontal": (1, 4)},
+    "DeviceLinkThroughputLimit": (10**6, 125 * 10**6),
+}
+_COMMANDS = ("AcquisitionStart", "AcquisitionStop", "TriggerSoftware", "TimestampLatch", "UserSetLoad")
+_READ_ONLY = ("PayloadSize", "TimestampLatchValue", "ResultingFrameRate", "NoiseReduction")
+_BOOLEAN = ("ReverseX", "GammaEnable", "LUTEnable")
+_LOCKED = ("TriggerSource", "TriggerActivation", "TriggerOverlap", "ReverseX")
+"""What is read-only while the trigger is on."""
 
 
 def description(*, without: tuple[str, ...] = ()) -> str:
@@ -413,6 +446,7 @@ def description(*, without: tuple[str, ...] = ()) -> str:
             f"<Address>{address:#x}</Address><Length>{struct.calcsize(code)}</Length><AccessMode>{mode}</AccessMode>"
         )
         place += f"<pPort>Device</pPort><Cachable>{cache}</Cachable>"
+        locked = "<pIsLocked>TriggerModeRegister</pIsLocked>" if name in _LOCKED else ""
         value = f"<pValue>{name}Register</pValue>"
         least, most, *step = _RANGES.get(name, (0, 2**31))
         bounds = f"<Min>{least}</Min><Max>{most}</Max>"
@@ -424,11 +458,11 @@ def description(*, without: tuple[str, ...] = ()) -> str:
                 f'<EnumEntry Name="{entry}"><Value>{number}</Value></EnumEntry>'
                 for entry, number in _ENUMERATIONS[name].items()
             )
-            nodes.append(f'<Enumeration Name="{name}">{entries}{value}</Enumeration>')
+            nodes.append(f'<Enumeration Name="{name}">{locked}{entries}{value}</Enumeration>')
         elif name in _COMMANDS:
             nodes.append(f'<Command Name="{name}">{value}<CommandValue>1</CommandValue></Command>')
-        elif name == "ReverseX":
-            nodes.append(f'<Boolean Name="{name}">{value}<OnValue>1</OnValue><OffValue>0</OffValue></Boolean>')
+        elif name in _BOOLEAN:
+            nodes.append(f'<Boolean Name="{name}">{locked}{value}<OnValue>1</OnValue><OffValue>0</OffValue></Boolean>')
         elif code == "d":
             nodes.append(f'<Float Name="{name}">{value}{bounds if name in _RANGES else ""}</Float>')
         else:
@@ -467,14 +501,19 @@ class Exposed:
 class MemoryCamera:
     """The camera. `deliver` takes each frame that leaves it.
 
-    first_frame : the number of the first frame after a start. without : features that it lacks.
+    first_frame : the number of the first frame after a start. without : features that it lacks. left : what another
+    program left of its features. stored : what its UserSet1 has. link : what it is on, by its GenTL
+    name.
     """
 
     stage: Stage
     fate: Callable[[], Fate] = Fate
     first_frame: int = 0
     without: tuple[str, ...] = ()
+    left: Mapping[str, float] = field(default_factory=dict)
+    stored: Mapping[str, float] = field(default_factory=dict)
     serial: str = "M1"
+    link: str = "Custom"
     deliver: Callable[[Exposed], None] = field(default=lambda _: None, repr=False)
 
     def __post_init__(self) -> None:
@@ -483,7 +522,9 @@ class MemoryCamera:
         self.xml = description(without=self.without).encode()
         self._values: dict[str, float | bytes] = dict.fromkeys(REGISTERS, 0)
         self._values |= {"Width": 120, "Height": 90, "PixelFormat": PIXEL_FORMATS["Mono8"], "ExposureTime": 5000.0}
-        self._values |= {"Gain": 1.0, "ExposureAuto": 1, "DeviceUserID": b""}
+        self._values |= {"Gain": 1.0, "ExposureAuto": 1, "DeviceUserID": b"", "TriggerDelay": 29.0}
+        self._values |= {"SharpnessEnhancement": 1.0, "BinningHorizontal": 1, "GevSCPSPacketSize": 9000}
+        self._values |= {"DeviceLinkThroughputLimit": 125 * 10**6, **self.left}
         self._triggered = threading.Semaphore(0)
         self._running = threading.Event()
         self._exposing = False
@@ -515,6 +556,8 @@ class MemoryCamera:
                 self.stop()
             case "TriggerSoftware" if not self._exposing and self._values["TriggerSource"] == 0:
                 self._triggered.release()
+            case "UserSetLoad" if self._values["UserSetSelector"] == 1:
+                self._values |= self.stored
             case "TimestampLatch":
                 self._values["TimestampLatchValue"] = time.monotonic_ns() + CLOCK_ZERO_NS
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import re
 import signal
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +34,7 @@ from slrig.errors import (
 from slrig.model import Frame, Size
 from tests.contract import genicam_bench, gentl_bench
 from tests.contract.genicam_bench import CAMERA, FakeGigE, Fate, Relay, require_aravis, scene
-from tests.contract.gentl_producer import OVERHEAD_S, MemoryCamera
+from tests.contract.gentl_producer import OVERHEAD_S, REGISTERS, MemoryCamera
 from tests.contract.stage import Stage
 from tests.unit.drivers.genicam.conftest import EXPOSURE_S, Device
 
@@ -269,7 +271,72 @@ def test_a_camera_with_other_names_of_features_is_read_and_triggered(kind: str) 
         camera.close()
 
 
+LEFT: dict[str, float] = {
+    **{"TriggerMode": 1, "GammaEnable": 1, "LUTEnable": 1, "SharpnessEnhancement": 3.0, "BinningHorizontal": 2},
+    **{"ReverseX": 1, "TriggerDelay": 5000.0},
+}
+
+
+def held(camera: MemoryCamera, *names: str) -> list[float]:
+    """What registers of the camera hold."""
+    found: list[float] = []
+    for name in names:
+        address, code = REGISTERS[name]
+        found += struct.unpack(f"<{code}", camera.read(address, struct.calcsize(code)))
+    return found
+
+
+def test_what_another_program_left_on_is_switched_off() -> None:
+    memory = MemoryCamera(Stage(scene()), left=LEFT)
+    with gentl_bench.serving(memory) as producer:
+        camera = gentl_bench.opened(producer)
+        camera.close()
+        assert held(memory, *LEFT) == [0, 0, 0, 1.0, 1, 0, 29.0]
+        assert camera.info.notes == ()
+        # Of a user set, too, unless the rig file says otherwise.
+        memory.stored = LEFT
+        camera = gentl_bench.opened(producer, user_set="UserSet1", features={"ReverseX": True, "TriggerDelay": 400.0})
+        camera.close()
+        assert held(memory, *LEFT) == [0, 0, 0, 1.0, 1, 1, 400.0]
+        with pytest.raises(UnsupportedByDeviceError, match=r"UserSetSelector UserSet7, it offers Default, UserSet1"):
+            gentl_bench.opened(producer, user_set="UserSet7")
+
+
+@pytest.mark.parametrize(
+    ("left", "words"),
+    [
+        ({"NoiseReduction": 2.0}, "stays on: .*NoiseReduction"),
+        ({"BlackLevel": 3.5}, "black level is 3.5"),
+        ({"LineDebouncerTime": 50.0}, r"input Line1 takes a pulse after 50 µs only \(LineDebouncerTime\)"),
+        ({"GevSCPSPacketSize": 1500}, "packets have 1500 bytes, 8 a frame.*mtu 9000"),
+        ({"DeviceLinkThroughputLimit": 10**6}, r"at most 1 MB/s .*a frame every 10\.8 ms.* = 125000000 \} lifts"),
+    ],
+)
+def test_what_an_industrial_camera_keeps_is_noted(left: dict[str, float], words: str) -> None:
+    with gentl_bench.serving(MemoryCamera(Stage(scene()), left=left)) as producer:
+        camera = gentl_bench.opened(producer)
+        camera.close()
+        (note,) = camera.info.notes
+        assert re.search(words, note)
+
+
 # ---- triggers and times
+
+
+@pytest.mark.parametrize(("features", "overlap"), [({}, 1), ({"TriggerOverlap": "PreviousFrame"}, 2)])
+def test_a_wire_trigger_is_set_while_it_is_off_and_overlaps_the_readout(
+    features: dict[str, object], overlap: int
+) -> None:
+    # Source and overlap are read-only while the trigger is on, and it was left on, for software.
+    memory = MemoryCamera(Stage(scene()), left={"TriggerMode": 1})
+    with gentl_bench.serving(memory) as producer:
+        camera = gentl_bench.opened(producer, features=features)
+        for trigger, mode in ((Trigger.SOFTWARE, [1, 0]), (Trigger.HARDWARE, [1, 1]), (Trigger.FREE, [0, 1])):
+            camera.arm(1, trigger)
+            assert held(memory, "TriggerMode", "TriggerSource") == mode
+            camera.disarm()
+        camera.close()
+        assert held(memory, "TriggerOverlap") == [overlap]
 
 
 @pytest.mark.parametrize(
