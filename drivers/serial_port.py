@@ -17,7 +17,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
-from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, LibraryMissingError
+from drivers.libraries import loading
+from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError
 
 SLICE_S = 0.02
 """Longest wait of one read; other requests to the port wait for it."""
@@ -53,7 +54,7 @@ class SerialPort:
     """
 
     def __init__(self, name: str, *, baud: int, device: str, driver: str) -> None:
-        serial = _library(driver)
+        serial = serial_module(driver)
         self._name, self._device, self._driver = name, device, driver
         target = resolve_port(name)
         # Two programs on one port would read each other's answers; a URL's handler has no lock.
@@ -92,7 +93,7 @@ class SerialPort:
     def _read(self) -> bytes:
         try:
             data: bytes = self._serial.read(max(1, self._serial.in_waiting))
-        except _library(self._driver).SerialException:
+        except serial_module(self._driver).SerialException:
             # Raised both when another program has read the bytes and when the port is gone.
             if not self._is_alive():
                 raise
@@ -113,9 +114,9 @@ class SerialPort:
     def _translate_errors(self, action: str) -> Iterator[None]:
         try:
             if not self._serial.is_open:
-                raise _library(self._driver).PortNotOpenError
+                raise serial_module(self._driver).PortNotOpenError
             yield
-        except (_library(self._driver).SerialException, OSError, _line_discipline_error()) as error:
+        except (serial_module(self._driver).SerialException, OSError, _line_discipline_error()) as error:
             message = (
                 f"cannot {action} the {self._device} on {self._name}, it is gone ({error}): it was unplugged, lost its "
                 "power or reset itself; plug it in and open the rig again"
@@ -129,13 +130,10 @@ def resolve_port(name: str) -> str:
     return str(link) if "/" not in name and link.exists() else name
 
 
-def _library(driver: str) -> Any:
-    try:
-        return importlib.import_module("serial")
-    except ImportError as missing:
-        install = "pip install pyserial"
-        message = f"driver '{driver}' needs pyserial, which is not installed ({missing}); {install}"
-        raise LibraryMissingError(message, install=install) from missing
+def serial_module(driver: str, module: str = "serial") -> Any:
+    """Return a module of pyserial. Raises LibraryMissingError."""
+    with loading(driver, "pyserial", install="pip install pyserial", packages="pyserial"):
+        return importlib.import_module(module)
 
 
 def _line_discipline_error() -> type[Exception]:

@@ -11,7 +11,6 @@ a device is first requested, because its import takes seconds.
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from drivers.libraries import loading
 from slrig.bundle import Strict
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, LibraryMissingError
 from slrig.model import Size
@@ -199,17 +199,10 @@ def load_depthai() -> Any:
     """Return the module `depthai`, version 3.12 or later. Raises LibraryMissingError if it is missing, broken or too
     old.
     """
-    # Finding it is fast; importing it is slow.
-    if importlib.util.find_spec("depthai") is None:
-        message = f"OAK cameras need the library depthai, which is not installed: {INSTALL}"
-        raise LibraryMissingError(message, install=INSTALL)
     for variable, value in ENVIRONMENT.items():
         os.environ.setdefault(variable, value)
-    try:
+    with loading("depthai", "depthai", install=INSTALL, packages="depthai"):
         vendor = importlib.import_module("depthai")
-    except ImportError as cause:
-        message = f"OAK cameras need the library depthai, which is installed and cannot be loaded ({cause}): {INSTALL}"
-        raise LibraryMissingError(message, install=INSTALL) from cause
     if not hasattr(vendor.Pipeline, "setStopOnDeviceLoss"):
         found = getattr(vendor, "__version__", "an unknown version")
         message = f"OAK cameras need depthai 3.12 or later, found {found}: {INSTALL}"

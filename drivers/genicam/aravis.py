@@ -18,8 +18,9 @@ from typing import Any
 
 from drivers.genicam.connection import GenICamConnection, GenicamOptions, GenICamStream, RawFrame, RawImage
 from drivers.genicam.link import find_forbidden
+from drivers.libraries import loading
 from slrig.devices import FoundDevice
-from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, LibraryMissingError, UnsupportedByDeviceError
+from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import Size
 
 _BUILDS = "libcairo2-dev gcc pkg-config python3-dev"
@@ -46,20 +47,15 @@ class AravisLibrary:
 @lru_cache(maxsize=1)
 def load_aravis() -> AravisLibrary:
     """Load Aravis once. Raises LibraryMissingError if PyGObject or the Aravis typelib is not installed."""
-    try:
+    with loading("genicam", "Aravis 0.8 and PyGObject", install=install_command(), packages="PyGObject"):
         gi = importlib.import_module("gi")
-        # PyGObject raises ValueError if the system has no typelib of that name.
-        gi.require_version("Aravis", "0.8")
+        try:
+            gi.require_version("Aravis", "0.8")
+        except ValueError as missing:
+            # The system has no typelib of that name.
+            raise ModuleNotFoundError(str(missing)) from missing
         aravis = importlib.import_module("gi.repository.Aravis")
         error = importlib.import_module("gi.repository.GLib").Error
-    except (ImportError, ValueError, AttributeError) as cause:
-        install = install_command()
-        message = (
-            f"the genicam driver needs Aravis 0.8 and PyGObject, found: {cause}; on Debian or Ubuntu: "
-            f"{install_command(system='linux')} (other systems: install Aravis with its introspection data, then the "
-            "extra)"
-        )
-        raise LibraryMissingError(message, install=install) from cause
     return AravisLibrary(aravis, error)
 
 

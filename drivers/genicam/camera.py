@@ -31,6 +31,7 @@ from drivers.genicam.connection import (
     differs,
 )
 from drivers.genicam.gentl import GentlConnection
+from drivers.genicam.link import link_notes
 from drivers.genicam.pixels import FORMATS, PfncFormat, decode_pixels
 from drivers.genicam.setup import set_trigger, set_up_camera
 from drivers.genicam.timing import Arrival, FrameNumbers, Interval, StartClock, TriggeredStarts, UntriggeredStarts
@@ -219,7 +220,7 @@ class Acquisition:
         }[self.trigger]
         message = (
             f"camera '{self._connection.name}': no frame that began after {after_ns} ns arrived in {timeout_s} s "
-            f"({self.trigger} trigger; skipped: {skipped}); {remedy}"
+            f"({self.trigger} trigger; skipped: {skipped}); {'; '.join([remedy, *link_notes(self._connection)])}"
         )
         return FrameTimeoutError(message)
 

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.genicam.connection import GenICamConnection, GenICamStream, GentlOptions, RawFrame, RawImage
+from drivers.libraries import loading
 from slrig.devices import FoundDevice
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, LibraryMissingError, UnsupportedByDeviceError
 from slrig.model import Size
@@ -53,11 +54,8 @@ def load_harvesters() -> Any:
     """Return the module `harvesters.core`. Raises LibraryMissingError if it, or its wheel of GenICam, is not
     installed.
     """
-    try:
+    with loading("gentl", "harvesters", install=INSTALL, packages="harvesters genicam"):
         return importlib.import_module("harvesters.core")
-    except ImportError as cause:
-        message = f"the gentl driver needs harvesters, found: {cause}; {INSTALL}"
-        raise LibraryMissingError(message, install=INSTALL) from cause
 
 
 @contextmanager

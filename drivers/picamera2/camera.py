@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from drivers.libraries import loading
 from drivers.v4l2.formats import PixelLayout, SamplePacking, colour_image, grey_image
 from slrig.bundle import Strict, validate
 from slrig.devices import (
@@ -40,7 +41,6 @@ from slrig.errors import (
     DeviceError,
     DeviceGoneError,
     FrameTimeoutError,
-    LibraryMissingError,
     UnsupportedByDeviceError,
 )
 from slrig.model import CameraFormat, Frame, Pixels, Size
@@ -72,7 +72,9 @@ class PiCameraOptions(Strict, use_attribute_docstrings=True):
     receivers stamp the start of a frame on the wire), or the start of its exposure, as in libcamera's documentation."""
 
 
-INSTALL = "sudo apt install python3-libcamera && pip install 'slrig[picamera2]'"
+INSTALL = (
+    "sudo apt install python3-libcamera python3-kms++ libcap-dev && pip install --upgrade simplejpeg 'slrig[picamera2]'"
+)
 
 _UNPACKED = re.compile(r"^(S(?P<bayer>[RGB]{4})|R)(?P<depth>8|10|12|14|16)$")
 _MIN_MAIN_SIZE = (64, 64)
@@ -109,14 +111,11 @@ def load_library() -> Any:
     LibraryMissingError
         picamera2 or libcamera is not installed.
     """
-    try:
+    library = "picamera2 and the system's libcamera"
+    where = " (in a virtual environment that was made with --system-site-packages)"
+    # The system's own simplejpeg is built for numpy 1.
+    with loading("picamera2", library, install=INSTALL, packages="simplejpeg picamera2", where=where):
         return importlib.import_module("picamera2").Picamera2
-    except ImportError as cause:
-        message = (
-            f"cameras of a Raspberry Pi need picamera2 and the system's libcamera, found: {cause}; {INSTALL} (in a "
-            "virtual environment that was made with --system-site-packages)"
-        )
-        raise LibraryMissingError(message, install=INSTALL) from cause
 
 
 def list_cameras() -> tuple[dict[str, Any], ...]:

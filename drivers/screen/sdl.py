@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.display.projector import ScanoutStart, rgb_pixels, start_of_queued
+from drivers.libraries import loading
 from drivers.screen.options import ScreenOptions
-from slrig.errors import DeviceError, LibraryMissingError, UnsupportedByDeviceError
+from slrig.errors import DeviceError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Pixels, Size
 
 _HINTS = (
@@ -247,15 +248,11 @@ def _stop_sdl(sdl: Any) -> None:
 
 @cache
 def _import_sdl() -> Any:
-    try:
-        with warnings.catch_warnings():
-            # PySDL2 reports the library that it found by a warning.
-            warnings.simplefilter("ignore")
-            return importlib.import_module("sdl2")
-    except ImportError as cause:
-        install = "pip install 'slrig[screen]'"
-        message = f"backend sdl of the driver 'screen' needs PySDL2, which cannot be imported ({cause}): {install}"
-        raise LibraryMissingError(message, install=install) from cause
+    install = "pip install 'slrig[screen]'"
+    with loading("screen", "PySDL2", install=install, packages="PySDL2 pysdl2-dll"), warnings.catch_warnings():
+        # PySDL2 reports the library that it found by a warning.
+        warnings.simplefilter("ignore")
+        return importlib.import_module("sdl2")
 
 
 def _survive_server_end(display: int) -> None:

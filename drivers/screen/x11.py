@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.display.projector import rgb_pixels
-from slrig.errors import DeviceError, DeviceGoneError, LibraryMissingError, UnsupportedByDeviceError
+from drivers.libraries import loading
+from slrig.errors import DeviceError, DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import Pattern, Pixels, Size
 
 VISIBILITY_NOTIFY, SELECTION_CLEAR = "VisibilityNotifyEvent", "SelectionClearEvent"
@@ -208,14 +209,11 @@ def event_name(event: Any) -> str:
 
 @cache
 def _import_xcffib() -> Any:
-    try:
+    with loading("screen", "xcffib and libxcb to speak to X", install=_INSTALL, packages="xcffib"):
         xcffib = import_module("xcffib")
         for module in ("xproto", *_EXTENSIONS.values()):
             # Before connecting: a connection knows the events of extensions that are imported.
             import_module(f"xcffib.{module}")
-    except (ImportError, OSError) as cause:
-        message = f"the driver 'screen' needs xcffib and libxcb to speak to X, found: {cause}; {_INSTALL}"
-        raise LibraryMissingError(message, install=_INSTALL) from cause
     _add_complete_notify(xcffib)
     return xcffib
 

@@ -9,7 +9,6 @@ Finding uses information of the system alone: opening a port restarts many board
 from __future__ import annotations
 
 import binascii
-import importlib
 import os
 import secrets
 import threading
@@ -19,9 +18,9 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
-from drivers.serial_port import SLICE_S, BytePort
+from drivers.serial_port import SLICE_S, BytePort, serial_module
 from slrig.devices import Clock, FoundDevice, SystemClock
-from slrig.errors import DeviceError, DeviceStateError, LibraryMissingError
+from slrig.errors import DeviceError, DeviceStateError
 
 NUMBERS = 10_000
 MAX_LINE_BYTES = 240
@@ -140,12 +139,7 @@ class LineSplitter:
 
 def find_ports(by_id: Path = BY_ID) -> tuple[FoundDevice, ...]:
     """Return the USB serial ports, each by a persistent name if available. Raises LibraryMissingError."""
-    try:
-        list_ports = importlib.import_module("serial.tools.list_ports")
-    except ImportError as missing:
-        install = "pip install pyserial"
-        message = f"driver 'serial_projector' needs pyserial, which is not installed ({missing}); {install}"
-        raise LibraryMissingError(message, install=install) from missing
+    list_ports = serial_module("serial_projector", "serial.tools.list_ports")
     persistent = _links_by_target(by_id)
     ports = sorted(list_ports.comports(), key=lambda port: str(port.device))
     return tuple(

@@ -128,7 +128,8 @@ MISSING: list[tuple[str, tuple[Callable[[], object], ...], str, str]] = [
         "picamera2",
         (picamera2.find_devices, lambda: picamera2.open_camera("left", {"device": "x"}, Path())),
         "--system-site-packages",
-        "sudo apt install python3-libcamera && pip install 'slrig[picamera2]'",
+        "sudo apt install python3-libcamera python3-kms++ libcap-dev && pip install --upgrade simplejpeg "
+        "'slrig[picamera2]'",
     ),
     (
         "harvesters.core",
@@ -179,11 +180,30 @@ def test_depthai_reports_nothing_to_its_maker_unless_the_user_asks_for_it(monkey
     assert os.environ["DEPTHAI_LEVEL"] == "debug"
 
 
-def test_a_library_that_cannot_be_loaded_is_named_with_the_cause(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+@pytest.mark.parametrize(
+    ("module", "calls", "install"),
+    [
+        (module.split(".")[0], calls, install)
+        for module, calls, _, install in MISSING
+        if module != "gi.repository.Aravis"
+    ],
+    ids=[each[0] for each in MISSING if each[0] != "gi.repository.Aravis"],
+)
+def test_a_library_that_was_built_for_others_is_named_with_the_command_that_builds_it_anew(
+    module: str,
+    calls: tuple[Callable[[], object], ...],
+    install: str,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
-    (tmp_path / "depthai.py").write_text("raise ImportError('libusb is missing')")
-    monkeypatch.delitem(sys.modules, "depthai", raising=False)
+    for loaded in LOADED:
+        loaded.cache_clear()
+    cause = "numpy.dtype size changed, may indicate binary incompatibility"
+    (tmp_path / f"{module}.py").write_text(f"raise ValueError({cause!r})")
+    for name in [name for name in sys.modules if name.split(".")[0] == module]:
+        monkeypatch.delitem(sys.modules, name)
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(LibraryMissingError, match=r"cannot be loaded .*libusb is missing"):
-        depthai.find_devices()
+    for call in calls:
+        with pytest.raises(LibraryMissingError, match=f"installed and cannot be loaded.*ValueError: {cause}") as broken:
+            call()
+        assert broken.value.install.startswith(f"{install} && pip install --force-reinstall")

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 from drivers.genicam import link
+from slrig.devices import Trigger
+from slrig.errors import FrameTimeoutError
 from tests.contract import gentl_bench
 from tests.contract.genicam_bench import scene
 from tests.contract.gentl_producer import MemoryCamera
@@ -23,10 +25,14 @@ def test_little_memory_for_usb_is_noted_with_the_command_that_gives_more(
     # 32 frames of 640 x 480 bytes.
     with gentl_bench.serving(MemoryCamera(Stage(scene()), link="U3V")) as producer:
         camera = gentl_bench.opened(producer, region=None)
+        camera.arm(1, Trigger.HARDWARE)
+        with pytest.raises(FrameTimeoutError, match="check the trigger's cable") as late:
+            camera.read(0, 0.0)
         camera.close()
     told = camera.info.notes
     assert len(told) == notes
     assert all("9 MB of the system" in note and f"sudo sh -c 'echo 1000 > {usbfs}'" in note for note in told)
+    assert all(note in str(late.value) for note in told)
 
 
 @pytest.mark.parametrize(("subclass", "permitted", "found"), [("05", False, 1), ("05", True, 0), ("02", False, 0)])

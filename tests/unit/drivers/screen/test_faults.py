@@ -293,7 +293,7 @@ def test_two_displays_of_one_name_are_refused() -> None:
 
 def test_a_missing_library_of_sdl_is_named_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     def lacking(name: str) -> object:
-        raise ImportError(name)
+        raise ModuleNotFoundError(name)
 
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
