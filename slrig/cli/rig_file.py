@@ -624,6 +624,8 @@ def _tell_drivers(drivers: Sequence[InstalledDriver], found: DiscoveredDevices, 
             state = "its library is missing, see below"
         elif driver.name in elsewhere:
             state = "not on this system, see below"
+        elif any(f"'{driver.name}'" in str(fault) for fault in found.faults):
+            state = "its search failed, see below"
         package = f"{driver.package} {driver.version}".strip()
         table.add_row(escape(driver.name), driver.kind, escape(package), state)
     console.print(table)

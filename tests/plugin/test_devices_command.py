@@ -60,6 +60,7 @@ def test_a_broken_package_is_listed_once_with_its_cause_and_its_removal(monkeypa
     assert faults["camera"] in shown
     assert "to remove it: pip uninstall x-package\n" in shown
     assert "Not looked for: finder driver 'y' failed: OSError: no bus\n" in shown
+    assert "its search failed" in " ".join(shown.split())
     assert devices.broken_packages(drivers) == (
         devices.BrokenPackage("x-package", ("x",), faults["camera"], "pip uninstall x-package"),
     )
