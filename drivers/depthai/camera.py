@@ -85,7 +85,8 @@ class OakCamera:
         self._frames.begin()
         self._device.send(self._stream.socket, control)
         if self._stream.external_trigger:
-            return AppliedSettings(self._requested[0] / 1e6, self._requested[1] / ISO_OF_GAIN_1, 1 / self._stream.fps)
+            period_s = self._stream.trigger_burst[0] / self._stream.fps
+            return AppliedSettings(self._requested[0] / 1e6, self._requested[1] / ISO_OF_GAIN_1, period_s)
         until_ns = time.monotonic_ns() + round((_SETTLE_S + 8 / self._stream.fps) * 1e9)
         last: OakFrame | None = None
         while (delivery := self._frames.take(until_ns)) is not None:
@@ -175,6 +176,18 @@ class OakCamera:
         if size.width_px > sensor.size.width_px or size.height_px > sensor.size.height_px:
             message = f"camera '{self._name}': requested {size}, its sensor {sensor.name} has {sensor.size}"
             raise UnsupportedByDeviceError(message)
+        if options.external_trigger and size.height_px < sensor.size.height_px:
+            message = (
+                f"camera '{self._name}': requested {size} with external_trigger, which gives frames of all "
+                f"{sensor.size.height_px} rows of its sensor only; leave size_px out"
+            )
+            raise UnsupportedByDeviceError(message)
+        if options.trigger_burst[0] - options.trigger_burst[1] != 1:
+            message = (
+                f"camera '{self._name}': requested trigger_burst {list(options.trigger_burst)}, one frame of each edge "
+                "must be left; write [1, 0], or [4, 3] as in Luxonis' examples"
+            )
+            raise UnsupportedByDeviceError(message)
         focus = options.focus
         if sensor.autofocus and focus is None:
             with suppress(CalibrationError):
@@ -194,6 +207,7 @@ class OakCamera:
             focus=focus,
             colour_temperature_k=options.colour_temperature_k,
             external_trigger=options.external_trigger,
+            trigger_burst=options.trigger_burst,
         )
 
     def _build_info(self) -> CameraInfo:
@@ -224,7 +238,7 @@ class OakCamera:
             control.setManualFocus(stream.focus)
         if stream.external_trigger:
             control.setFrameSyncMode(vendor.CameraControl.FrameSyncMode.INPUT)
-            control.setExternalTrigger(1, 0)
+            control.setExternalTrigger(*stream.trigger_burst)
 
     def _matches_settings(self, delivery: OakFrame) -> bool:
         exposure_us, iso = self._requested

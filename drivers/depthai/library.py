@@ -27,6 +27,7 @@ from slrig.model import Size
 DEFAULT_FPS = 20.0
 
 Socket = Literal["CAM_A", "CAM_B", "CAM_C", "CAM_D", "CAM_E", "CAM_F", "CAM_G", "CAM_H"]
+TriggerCount = Annotated[int, Field(ge=0, le=255)]
 PixelExtent = Annotated[int, Field(ge=16, le=16384)]
 
 
@@ -54,7 +55,13 @@ class OakOptions(Strict, use_attribute_docstrings=True):
     """Fixed white balance of a colour camera."""
 
     external_trigger: bool = False
-    """A rising edge on the pin FSIN starts each exposure. The same for all cameras of a device."""
+    """A rising edge on the pin FSIN starts each exposure. The same for all cameras of a device. Needs frames of the
+    sensor's full height: with fewer rows, none come."""
+
+    trigger_burst: Annotated[tuple[TriggerCount, TriggerCount], Field(strict=False)] = (1, 0)
+    """With an external trigger: how many frames each edge takes, and how many of them are thrown away; one must be
+    left. Luxonis' examples have [4, 3]: try that if [1, 0] gives no frames. The frame that is left then begins three
+    frame times after its edge, so its pattern must be lit for as long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +78,7 @@ class OakStream:
     focus: int | None
     colour_temperature_k: int
     external_trigger: bool
+    trigger_burst: tuple[int, int]
 
     @property
     def period_ns(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import threading
@@ -63,6 +64,16 @@ def armed(camera: Camera) -> Camera:
         ({"refuses": "firmware is broken"}, DeviceError, "fails: firmware is broken"),
         ({"chips": [Chip("CAM_A", "IMX378")]}, UnsupportedByDeviceError, r"requested CAM_B .* has: CAM_A \(IMX378, 64"),
         ({"options": {"size_px": [128, 96]}}, UnsupportedByDeviceError, "requested 128 x 96, its sensor OV9282 has 64"),
+        (
+            {"options": {"size_px": [64, 32], "external_trigger": True}},
+            UnsupportedByDeviceError,
+            r"requested 64 x 32 with external_trigger.* all \d+ rows",
+        ),
+        (
+            {"options": {"external_trigger": True, "trigger_burst": [4, 2]}},
+            UnsupportedByDeviceError,
+            r"trigger_burst \[4, 2\], one frame",
+        ),
         ({"chips": LENSES}, UnsupportedByDeviceError, r"has autofocus.* write focus = 0"),
     ],
 )
@@ -439,6 +450,14 @@ def test_an_edge_on_the_wire_is_one_frame(head: Opens) -> None:
         assert left.dropped_count == (2 if turn == 2 else left.dropped_count)
         assert (left.image.mean() > 20) == bool(turn % 2)
         last = left
+
+
+def test_a_burst_that_each_edge_takes_is_asked_for_and_waited_for(head: Opens) -> None:
+    pair = head(options={"external_trigger": True, "trigger_burst": [4, 3]})
+    for camera in pair.cameras.values():
+        assert camera.configure(CameraSettings(0.004)).min_period_s == pytest.approx(4 / 100)
+    for sensor in pair.oak.sensors.values():
+        assert re.search(r"FramesBurst: 4\s+lowPowerNumFramesDiscard: 3", str(sensor.initialControl))
 
 
 def test_a_wire_trigger_needs_a_sensor_that_waits_and_its_option(head: Opens) -> None:
