@@ -24,7 +24,7 @@ from pydantic import TypeAdapter
 
 from slrig.accept.evaluation import Reading, ReadingPoints
 from slrig.accept.plan import AcceptancePlan, Step
-from slrig.bundle import write_file
+from slrig.bundle import stored_json, write_file
 from slrig.calibrate.store import plain
 from slrig.calibration import Decision
 from slrig.disk import storage_errors
@@ -121,7 +121,7 @@ def record_json(record: AcceptanceRecord) -> bytes:
 def record_from_json(text: bytes, source: str) -> AcceptanceRecord:
     """The inverse of `record_json`. Raises StorageError when it is not that."""
     try:
-        found = json.loads(text)
+        found = stored_json(text)
         if found["format"] != _FORMAT:
             raise KeyError(found["format"])  # noqa: TRY301 - told with the other faults of the file
         return _records.validate_python(found)
@@ -167,8 +167,7 @@ class AcceptanceStore:
                     record = record_from_json(self._data.read(place / RECORD), str(place / RECORD))
                 except (StorageError, FileNotFoundError) as error:
                     _log.warning("an acceptance test is put aside", folder=place.name, cause=str(error))
-                    self._data.orphans.mkdir(exist_ok=True)
-                    place.rename(self._data.orphans / f"acceptance-{place.name}")
+                    self._data.put_aside(place)
                     continue
                 for stray in place.glob(".*"):
                     # Frames of a capture that was cut off, or a part of a file.
@@ -204,7 +203,11 @@ class AcceptanceStore:
         report = self.folder(record.id) / JSON
         if record.state is not AcceptanceState.OPEN or not report.is_file():
             return record
-        decided = Decision(json.loads(report.read_bytes())["decision"])
+        try:
+            decided = Decision(stored_json(report.read_bytes())["decision"])
+        except (ValueError, KeyError, TypeError, OSError) as error:
+            _log.warning("the report of an acceptance test is damaged", test=str(record.id), cause=str(error))
+            return record
         return replace(record, state=AcceptanceState.FINISHED, decision=decided)
 
 

@@ -100,6 +100,7 @@ from slrig.bundle.validation import (
     read_json_model,
     read_text,
     read_toml,
+    stored_json,
     validate,
 )
 from slrig.bundle.writing import (
@@ -185,6 +186,7 @@ __all__ = [
     "read_with_colour",
     "refuse_alternatives",
     "require_two_rays",
+    "stored_json",
     "sync_folder",
     "sync_tree",
     "turntable_entry",

@@ -120,6 +120,15 @@ def read_text(path: Path, max_bytes: int, error: type[InvalidInputError]) -> str
         raise error(message) from cause
 
 
+def stored_json(text: str | bytes) -> Any:
+    """The data of a JSON text that slrig wrote itself. Raises ValueError: it is damaged."""
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        message = "JSON that is nested too deeply"
+        raise ValueError(message) from error
+
+
 def read_json(text: str, source: Path, error: type[InvalidInputError]) -> Any:
     """Return the data of a strict JSON text: no NaN, no infinity, no duplicate key.
     Raises InvalidInputError, of the class `error`, with the line of the fault.

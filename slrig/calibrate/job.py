@@ -18,6 +18,7 @@ import structlog
 from slrig.bundle import (
     check_calibration,
     read_calibration,
+    stored_json,
     write_calibration,
     write_durably,
     write_opencv_calibration,
@@ -884,7 +885,7 @@ def named_by_scans(scans: Path) -> set[str]:
     names = set()
     for scan in (place for place in scans.iterdir() if not place.is_symlink()):
         with suppress(OSError, ValueError, KeyError, TypeError):
-            names.add(_session_of(json.loads((scan / "report.json").read_bytes())["calibration"]["id"]))
+            names.add(_session_of(stored_json((scan / "report.json").read_bytes())["calibration"]["id"]))
             continue
         with suppress(OSError, CalibrationError):
             # A scan that got no mesh may be reconstructed yet.

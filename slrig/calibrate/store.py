@@ -28,7 +28,15 @@ import structlog
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
-from slrig.bundle import read_arrays, read_calibration, sync_folder, sync_tree, write_durably, write_file
+from slrig.bundle import (
+    read_arrays,
+    read_calibration,
+    stored_json,
+    sync_folder,
+    sync_tree,
+    write_durably,
+    write_file,
+)
 from slrig.calibration import (
     PROJECTOR,
     Board,
@@ -382,9 +390,9 @@ class CalibrationStore:
             try:
                 text = self._folder.read(place / SESSION)
                 found.append(session_from_json(text, str(place / SESSION)))
-            except (StorageError, FileNotFoundError):
-                self._folder.orphans.mkdir(exist_ok=True)
-                place.rename(self._folder.orphans / place.name)
+            except (StorageError, FileNotFoundError) as error:
+                _log.error("a calibration cannot be read, and is put aside", folder=place.name, cause=str(error))
+                self._folder.put_aside(place)
         return sorted(found, key=lambda session: session.number)
 
     def create(self, session: SessionRecord) -> None:
@@ -446,7 +454,7 @@ class CalibrationStore:
         path = self._pointer
         try:
             with disk_errors(path):
-                document = json.loads(path.read_bytes())
+                document = stored_json(path.read_bytes())
             if document["format"] != _ACTIVE_FORMAT:
                 raise KeyError(document["format"])  # noqa: TRY301 - told with the other faults of the file
             return ActivePointer(UUID(document["id"]), int(document["solve"]))

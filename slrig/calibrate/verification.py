@@ -4,7 +4,6 @@ plot.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +18,7 @@ from markupsafe import Markup
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from slrig.bundle import read_calibration
+from slrig.bundle import read_calibration, stored_json
 from slrig.calibrate.store import USUAL_PATTERNS
 from slrig.calibration import Board
 from slrig.calibration.health import (
@@ -315,7 +314,7 @@ class RigHealth:
             return outcome or Outcome()
         if job.kind is JobKind.SCAN:
             try:
-                self._note_scan(job_id, json.loads((self._data.scan(job_id) / REPORT).read_bytes()))
+                self._note_scan(job_id, stored_json((self._data.scan(job_id) / REPORT).read_bytes()))
             except Exception:  # noqa: BLE001 - an error here must not fail the scan
                 _log.exception("what a scan says of its calibration could not be noted")
             return outcome

@@ -408,11 +408,14 @@ class DataFolder:
             shutil.rmtree(gone, ignore_errors=True)
 
     def put_aside(self, place: Path) -> None:
-        """Move files that no record knows to `orphans`."""
-        self.orphans.mkdir(exist_ok=True)
+        """Move files that no record knows to `orphans`, beside what was put there before. Raises StorageError."""
         above = place.parent.relative_to(self.root).parts
         name = place.name if above == (SCANS,) else "-".join([*above, place.name])
-        place.rename(self.orphans / name)
+        with disk_errors(place):
+            self.orphans.mkdir(exist_ok=True)
+            if os.path.lexists(self.orphans / name):
+                name = f"{name}-{uuid4().hex[:8]}"
+            place.rename(self.orphans / name)
 
     def keep_bundle(self, job_id: UUID, place: Path) -> None:
         """Put the bundle of a job that came to nothing in its place, whole or cut short, and nothing else of it. Does

@@ -7,7 +7,6 @@ taken over.
 from __future__ import annotations
 
 import hashlib
-import json
 import platform
 import random
 import sqlite3
@@ -47,6 +46,7 @@ from sqlalchemy.engine.interfaces import DBAPIConnection, DBAPICursor
 from sqlalchemy.exc import DatabaseError, OperationalError
 from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column
 
+from slrig.bundle import stored_json
 from slrig.errors import DamagedError, InvalidInputError, StorageError
 from slrig.failure import JobFailure, disk_errors
 from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState
@@ -254,8 +254,8 @@ class _UnreadableJson(dict[str, Any]):
 
 def _from_json(text: str | bytes) -> Any:
     try:
-        return json.loads(text)
-    except (ValueError, RecursionError):
+        return stored_json(text)
+    except ValueError:
         return _UnreadableJson()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -14,6 +13,7 @@ from uuid import UUID, uuid4
 import numpy as np
 import structlog
 
+from slrig.bundle import stored_json
 from slrig.errors import (
     ConfigError,
     DeviceError,
@@ -84,7 +84,7 @@ def found_axis(model: Path) -> MeasuredAxis | None:
 def _report(model: Path) -> Iterator[dict[str, Any]]:
     """A model's report. Raises StorageError: it cannot be read, or lacks what is looked for within the block."""
     try:
-        yield json.loads((model / REPORT).read_bytes())
+        yield stored_json((model / REPORT).read_bytes())
     except (OSError, ValueError, KeyError, TypeError) as error:
         message = f"{model / REPORT} cannot be read ({error}). Make the model again."
         raise StorageError(message) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,7 +11,7 @@ from uuid import UUID
 
 from pydantic import Field, TypeAdapter
 
-from slrig.bundle import TurnedBy
+from slrig.bundle import TurnedBy, stored_json
 from slrig.errors import ConfigError
 from slrig.model import FloatArray
 from slrig.scan.plan import ScanPlan, SeriesPlace
@@ -103,7 +102,7 @@ StartingPoses = TurntablePoses | GivenPoses | UnknownPoses | MarkerPoses
 def turntable_angle(report: bytes) -> tuple[float, str | None] | None:
     """Where the turntable stood, deg, and what that counts from, as a scan's report says; None where it does not."""
     try:
-        turntable = json.loads(report)["turntable"]
+        turntable = stored_json(report)["turntable"]
         return float(turntable["angle_deg"]), turntable.get("count")
     except (ValueError, KeyError, TypeError):
         return None

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle import sync_folder, sync_tree, write_file
+from slrig.bundle import stored_json, sync_folder, sync_tree, write_file
 from slrig.disk import staging_name, storage_errors
 from slrig.errors import InvalidInputError
 from slrig.model import FloatArray, IntArray, Mesh, PointCurves
@@ -323,7 +323,7 @@ def _require_replaceable(output: Path, replaces: str) -> None:
 
 def _is_report(path: Path, of: str) -> bool:
     try:
-        return bool(json.loads(path.read_bytes()).get("format") == of)
+        return bool(stored_json(path.read_bytes()).get("format") == of)
     except (OSError, ValueError, AttributeError):
         return False
 

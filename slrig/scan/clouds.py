@@ -21,7 +21,7 @@ import tifffile
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slrig.bundle import CALIBRATION, BundleFiles, open_bundle, read_calibration, read_description
+from slrig.bundle import CALIBRATION, BundleFiles, open_bundle, read_calibration, read_description, stored_json
 from slrig.disk import storage_errors
 from slrig.errors import InvalidInputError, NothingToReconstructError
 from slrig.jobs.data_folder import BUNDLE
@@ -434,7 +434,7 @@ def _refused(path: Path, device: Pinhole) -> NDArray[np.uint8]:
 
 def _causes(path: Path) -> list[str]:
     try:
-        return [str(cause["name"]) for cause in json.loads(_read(path))["causes"]]
+        return [str(cause["name"]) for cause in stored_json(_read(path))["causes"]]
     except (ValueError, KeyError, TypeError) as cause:
         message = f"{path.name}: it does not name the causes of refused pixels; reconstruct the bundle again"
         raise InvalidInputError(message) from cause

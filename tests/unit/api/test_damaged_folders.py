@@ -14,7 +14,7 @@ from fastapi.testclient import TestClient
 
 from slrig.jobs.data_folder import check_files
 from tests.unit.api.conftest import ServedBench, client_of, ended
-from tests.unit.api.test_calibration import opened, settled, shot
+from tests.unit.api.test_calibration import BOARD, opened, settled, shot
 
 
 @contextmanager
@@ -68,6 +68,11 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Sound:
         client.post(f"/calibration/{calibration}/solve", json={})
         assert settled(client, calibration)["state"] == "solved"
         assert client.post(f"/calibration/{calibration}/activate").status_code == 200
+        preset = client.get("/preset/fast").json()
+        assert client.put("/preset/mine", json=preset).status_code == 200
+        schedule = {"task": "verification", "cron": "0 3 * * *", "options": {"board": BOARD}}
+        assert client.post("/schedule", json=schedule).status_code == 201
+        assert client.post("/acceptance", json={}).status_code == 201
         assert all(found is None for _, found in check_files(served.service.folder.root))
         found = fetched(client)
         assert {status for status, _ in found.values()} == {200}
@@ -144,6 +149,8 @@ def test_damaged_files_that_were_made_on_request_are_made_anew(sound: Sound, tmp
         assert {path: content for path, (_, content) in fetched(client).items()} == sound.answers
 
 
+LISTS = ("/scan", "/model", "/calibration", "/acceptance", "/schedule", "/audit", "/preset")
+
 GARBAGE: dict[str, bytes | None] = {
     "emptied": b"",
     "opened": b"{",
@@ -179,7 +186,7 @@ def test_service_starts_on_any_damaged_folder_and_serves_what_is_whole(
         if records == "lost":
             (root / "slrig.sqlite").unlink()
         with serving(root) as (_, client):
-            for where in ("/scan", "/model", "/calibration", "/schedule", "/audit", "/preset", "/rig", "/metrics"):
+            for where in (*LISTS, "/rig", "/rig/turntable", "/rig/health", "/rig/examinations", "/metrics"):
                 assert client.get(where).status_code == 200, (name, kind, where)
             for scan in scans:
                 if scan not in name:

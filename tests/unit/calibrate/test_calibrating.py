@@ -407,7 +407,7 @@ def test_links_are_not_followed_and_folders_of_no_session_put_aside(bench: Calib
     place.symlink_to(elsewhere)
     (bench.folder.calibrations / "nowhere").symlink_to(tmp_path / "absent")
     assert CalibrationStore(bench.folder).load() == []
-    assert (bench.folder.orphans / stray.name / "session.json").is_file()
+    assert (bench.folder.orphans / f"calibrations-{stray.name}" / "session.json").is_file()
     store.delete(session_id)
     assert not place.is_symlink()
     assert (elsewhere / "session.json").is_file()
