@@ -527,7 +527,7 @@ class MemoryCamera:
         self._values |= {"DeviceLinkThroughputLimit": 125 * 10**6, **self.left}
         self._triggered = threading.Semaphore(0)
         self._running = threading.Event()
-        self._exposing = False
+        self._exposing = self._reading = False
         self._thread: threading.Thread | None = None
 
     def read(self, address: int, count: int) -> bytes:
@@ -562,7 +562,9 @@ class MemoryCamera:
                 self._values["TimestampLatchValue"] = time.monotonic_ns() + CLOCK_ZERO_NS
 
     def pulse(self) -> None:
-        if not self._exposing and self._values["TriggerSource"] == 1:
+        """An edge on the wire: ignored during an exposure and, unless triggers may overlap it, during read-out."""
+        ready = not self._exposing and (self._values["TriggerOverlap"] or not self._reading)
+        if ready and self._values["TriggerSource"] == 1:
             self._triggered.release()
 
     def stop(self) -> None:
@@ -599,7 +601,7 @@ class MemoryCamera:
             while (left_ns := end_ns - time.monotonic_ns()) > 0:
                 never.wait(left_ns / 1e9)
             self.exposures.append((start_ns, end_ns))
-            self._exposing = False
+            self._exposing, self._reading = False, True
             size = Size(int(self._values["Width"]), int(self._values["Height"]))
             image = self.stage.exposed(start_ns, end_ns, gain=float(self._values["Gain"]))
             data = image[: size.height_px, : size.width_px].tobytes()
@@ -608,4 +610,5 @@ class MemoryCamera:
             if fate.lost < 1:
                 self.deliver(Exposed(number, start_ns + CLOCK_ZERO_NS, data, size, whole=fate.lost == 0))
             number += 1
+            self._reading = False
             never.wait(OVERHEAD_S)
