@@ -18,7 +18,7 @@ def measure_trigger_period(rig: Rig, sequence: PatternSequence) -> tuple[float, 
 
     The two are equal if cameras follow the rate that they state. Else the least is found to a sixteenth of the first.
     Afterwards the projector is dark and the cameras are disarmed.
-    Raises FrameTimeoutError: they miss pulses even when these come three times more slowly; DeviceError.
+    Raises FrameTimeoutError: they miss pulses even when these come four times more slowly; DeviceError.
     """
     applied = {name: rig.cameras[name].configure(each) for name, each in rig.settings.items()}
     triggers = dict.fromkeys(rig.cameras, Trigger.HARDWARE)
@@ -32,7 +32,7 @@ def measure_trigger_period(rig: Rig, sequence: PatternSequence) -> tuple[float, 
         works_s = next((each * asked_s for each in SLOWER if _is_followed(session, lit_s, each * asked_s)), None)
         if works_s is None:
             message = (
-                f"cameras miss trigger pulses even when these come every {SLOWER[-1] * asked_s:.6g} s; check the "
+                f"cameras miss trigger pulses even when these come every {max(SLOWER) * asked_s:.6g} s; check the "
                 "trigger cable, its level and edge, and filters of the cameras' inputs"
             )
             raise FrameTimeoutError(message)

@@ -585,6 +585,7 @@ def test_a_shift_shows_in_the_brightness_of_the_frames(first_column_px: float, l
         (0.0115, 0.0044, 2, "every second pulse"),
         # A rolling shutter that is three times slower by wire.
         (0.0115, 0.021, 3, "every third pulse"),
+        (0.0115, 0.0246, 4, "every fourth pulse"),
     ],
 )
 def test_a_camera_that_misses_pulses_is_played_to_more_slowly_and_the_next_time_at_once(
@@ -603,6 +604,13 @@ def test_a_camera_that_misses_pulses_is_played_to_more_slowly_and_the_next_time_
         list(capture(rig, SEQUENCE))
     played_s = [period_s for _, period_s in fake.world.periods_s[2:]]
     assert played_s == pytest.approx([times * told_s, *(step * told_s for step in (1, times))])
+
+
+@pytest.mark.parametrize(("drop", "times"), [(range(3, COUNT, 4), 2), (range(3, 4), 1)])
+def test_a_camera_that_misses_some_pulses_is_played_to_more_slowly_but_not_for_one(drop: range, times: int) -> None:
+    fake = CaptureRun(wired(drop=frozenset(drop))).run().fake
+    (_, first_s), (_, second_s) = fake.world.periods_s
+    assert second_s == pytest.approx(times * first_s)
 
 
 # ---- the time from pulse to pulse
