@@ -15,8 +15,8 @@ column. A calibration for 912 x 1140 pixels accounts for this: its fy is twice i
 
 Sequences. Commands are sent in the order stop, set, validate, start, with the waits of TI's programs
 (`drivers.pattern_engine.patience`). `play` shows the loaded sequence once, with a pulse on TRIG_OUT_1 per pattern.
-`show` plays a sequence of one pattern, which ends by itself within 2 s; while this program lives, it restarts it, for
-at most `hold_s`. Dark means: sequence stopped and every LED off.
+`show` plays a sequence of one pattern, which ends by itself within 2 s; while this program lives, it restarts it once a
+second, with the LEDs off meanwhile, for at most `hold_s`. Dark means: sequence stopped and every LED off.
 
 Tables. All patterns of a sequence have the same times, so the table without times of their own is used (trigger mode
 1), as in TI's demonstration of the controller (main.c, `Demo_PatternSequenceLegacy`). TI's DLP SDK uses the other one
@@ -33,8 +33,8 @@ manual has it the other way round. 5 % with the wrong polarity is 95 %. Until th
 registers are set to half, which is the same for both, and the light is on for a twelfth of the time: 4.2 % on average.
 
 Untested on hardware; tested against a simulated device that implements TI's documents and sources below a kernel's
-hidraw node. To be checked on hardware: light between a stop and a start (a held pattern may blink once a second), the
-polarity of the trigger output, and the loading time of a picture (`image_load_s`; `slrig latency` measures it).
+hidraw node. To be checked on hardware: how long a held pattern is dark once a second, the polarity of the trigger
+output, and the loading time of a picture (`image_load_s`; `slrig latency` measures it).
 
 The DLPC900 (LightCrafter 6500, 9000) frames its commands alike, but has other pattern tables: `drivers.dlpc900`.
 """

@@ -14,8 +14,8 @@ docstring cites.
 
 Sequences. `play` shows the loaded sequence once. TRIG_OUT_1 is on while a pattern is lit, and needs a dark time between
 two patterns to change; so each period is at least 105 µs (DLP500YX 62 µs) longer than its exposure. `show` shows one
-pattern and then one without any LED, within 2 s, and restarts that while this program lives, for at most `hold_s`. Dark
-means: every LED off, and the sequence stopped.
+pattern and then one without any LED, within 2 s, and restarts that once a second while this program lives, with the
+LEDs off meanwhile, for at most `hold_s`. Dark means: every LED off, and the sequence stopped.
 
 LED current. The evaluation modules have no LEDs: a third-party driver board is at the connector, and the guide warns
 that the polarity may be inverted there (table 2-67). As for the DLPC350: until the rig file gives the polarity, the
@@ -24,9 +24,9 @@ nothing is played; `slrig doctor` determines it. This driver cannot switch, or d
 follow the LED enables.
 
 To be checked on hardware: whether LEDs come on at a start after LED enables were off (a user of a DLP9000 reported that
-they did not, at firmware 5), what is lit after the end of a played sequence, light between a stop and a start (a held
-pattern may blink once a second), whether the status says that a sequence has ended, the byte order of a pixel (frames
-show it), and the delay of the light (`start_s`).
+they did not, at firmware 5), what is lit after the end of a played sequence, how long a held pattern is dark once a
+second, whether the status says that a sequence has ended, the byte order of a pixel (frames show it), and the delay of
+the light (`start_s`).
 
 Not used. Standby: waking within two minutes is forbidden (table 2-35). The mirrors' idle mode: LEDs were reported on in
 it. Video input, patterns from flash, more than one bit per pattern, TRIG_IN, blocks of mirrors.

@@ -487,10 +487,14 @@ class UsbEngine(ABC):
         self.set_byte(UsbCommand.START_STOP, 0)
 
     def restart(self) -> None:
-        """Stop the current sequence, and start it from its beginning."""
+        """Stop the current sequence, and start it from its beginning. It is dark meanwhile, and stays so if this fails
+        or the program dies: a stop may leave the last pattern on the mirrors.
+        """
+        self.switch_leds(by_sequence=False)
         self.stop()
         self.wait_until_stopped()
         self.start()
+        self.switch_leds(by_sequence=True)
 
     @abstractmethod
     def wait_until_stopped(self) -> None:

@@ -254,6 +254,18 @@ def test_an_engine_that_takes_its_time_opens_shows_and_plays(made: MakesBench, l
     assert bench.clock.now_ns() < 40e9
 
 
+@USB
+def test_it_is_dark_from_a_stop_until_the_start(made: MakesBench) -> None:
+    bench = made(times=Times(stop=0.5))
+    projector = bench.loaded()
+    projector.show(0)
+    bench.clock.advance(1.3)
+    assert bench.engine.running
+    assert bench.engine.lit is None, "its host may die now"
+    bench.clock.advance(0.4)
+    assert bench.shows(bench.sequence.profiles[0])
+
+
 @pytest.mark.parametrize(
     ("made", "told"),
     [("dlpc350", "did not stop the sequence in time"), ("dlpc900", "did not take definition .* not in this mode")],
