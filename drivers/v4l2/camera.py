@@ -25,7 +25,7 @@ from drivers.v4l2.controls import (
     switch_off_processing,
 )
 from drivers.v4l2.finding import CameraNode, NodeIdentity, query_identity, resolve_node
-from drivers.v4l2.formats import CorruptFrameError, PixelLayout, colour_image, grey_image
+from drivers.v4l2.formats import CorruptFrameError, PaddedFrameError, PixelLayout, colour_image, grey_image
 from drivers.v4l2.options import V4L2Options
 from drivers.v4l2.stream import (
     PERIOD_TOLERANCE,
@@ -56,12 +56,23 @@ class _SkippedFrames:
 
     stale: int = 0
     corrupt: int = 0
+    padded: int = 0
     repeated: int = 0
     last_fault: str = ""
 
     def __str__(self) -> str:
         counts = f"{self.stale} stale, {self.corrupt} corrupt, {self.repeated} repeated"
         return f"{counts}; the last corrupt one: {self.last_fault}" if self.last_fault else counts
+
+    @property
+    def cause(self) -> str:
+        """The likeliest cause, and what to do."""
+        if self.padded > 1 and self.padded == self.corrupt:
+            return (
+                f"This camera pads its frames: all {self.padded} that could be used end alike. Write another "
+                "pixel_format (YUYV, NV12) into the camera's table"
+            )
+        return "Wait longer, or check cable and bandwidth (dmesg | tail)"
 
 
 class V4L2Camera:
@@ -195,8 +206,7 @@ class V4L2Camera:
                     message = (
                         f"camera '{self._name}': no frame exposed entirely after {after_ns} ns came in "
                         f"{timeout_s:g} s; skipped: {skipped}. Frames come every {self._period_ns / 1e6:.3g} ms, "
-                        f"exposed for {self._applied.exposure_s * 1e3:.3g} ms: wait longer, or check cable and "
-                        "bandwidth (dmesg | tail)"
+                        f"exposed for {self._applied.exposure_s * 1e3:.3g} ms. {skipped.cause}"
                     )
                     raise FrameTimeoutError(message)
 
@@ -247,6 +257,7 @@ class V4L2Camera:
             return grey(), colour if negotiated.layout.has_colour else None
         except CorruptFrameError as fault:
             skipped.corrupt += 1
+            skipped.padded += isinstance(fault, PaddedFrameError)
             skipped.last_fault = str(fault)
             return None
 

@@ -37,11 +37,16 @@ _FULL_RANGE: NDArray[np.uint8] = np.clip(np.rint((np.arange(256) - 16.0) * 255 /
 _NO_END = "Premature end of JPEG file"
 _STRAY_BYTES = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
 _MAX_STRAY_BYTES = 16
-"""Bytes allowed between the last block of a JPEG and its end marker: some cameras leave a few there."""
+"""Bytes allowed between the last block of a JPEG and its end marker: some cameras leave a few there. Zeros are padding,
+however many."""
 
 
 class CorruptFrameError(ValueError):
     """A buffer does not hold a whole frame, for the cause in the message; the frame is skipped."""
+
+
+class PaddedFrameError(CorruptFrameError):
+    """A JPEG has bytes between its last block and its end: it was damaged, or its camera pads every frame so."""
 
 
 class SamplePacking(StrEnum):
@@ -58,6 +63,12 @@ class SamplePacking(StrEnum):
     """Luma first: Y U Y V."""
     ODD_BYTES = "odd bytes"
     """Colour first: U Y V Y."""
+    PLANE_AND_PAIRS = "plane and pairs"
+    """All luma, then U V U V with half as many rows."""
+    PLANES = "planes"
+    """All luma, then all U and all V, each with half as many rows and columns, and half the stride."""
+    TRIPLES = "triples"
+    """Three colours, one byte each."""
     JPEG = "jpeg"
 
 
@@ -65,23 +76,25 @@ class SamplePacking(StrEnum):
 class PixelLayout:
     """Layout of a pixel format. bayer : the first row's two colours and the second row's, None for grey.
 
-    red_first : the colour difference of red comes before that of blue.
+    red_first : red, or its colour difference, comes before blue. shift : bits by which 16-bit words hold their samples
+    shifted up.
     """
 
     bit_depth: int
     packing: SamplePacking
     bayer: str | None = None
     red_first: bool = False
+    shift: int = 0
 
     @property
     def is_luma(self) -> bool:
         """True if the samples are the luma of a colour image."""
-        return self.packing in (SamplePacking.EVEN_BYTES, SamplePacking.ODD_BYTES, SamplePacking.JPEG)
+        return self.packing in _COLOUR_DIFFERENCES or self.packing is SamplePacking.JPEG
 
     @property
     def has_colour(self) -> bool:
         """True if `colour_image` can read it."""
-        return self.bayer is not None or self.is_luma
+        return self.bayer is not None or self.is_luma or self.packing is SamplePacking.TRIPLES
 
 
 def _layouts() -> dict[str, PixelLayout]:
@@ -97,6 +110,12 @@ def _layouts() -> dict[str, PixelLayout]:
         "YVYU": PixelLayout(8, SamplePacking.EVEN_BYTES, red_first=True),
         "UYVY": PixelLayout(8, SamplePacking.ODD_BYTES),
         "VYUY": PixelLayout(8, SamplePacking.ODD_BYTES, red_first=True),
+        "NV12": PixelLayout(8, SamplePacking.PLANE_AND_PAIRS),
+        "NV21": PixelLayout(8, SamplePacking.PLANE_AND_PAIRS, red_first=True),
+        "YU12": PixelLayout(8, SamplePacking.PLANES),
+        "YV12": PixelLayout(8, SamplePacking.PLANES, red_first=True),
+        "RGB3": PixelLayout(8, SamplePacking.TRIPLES, red_first=True),
+        "BGR3": PixelLayout(8, SamplePacking.TRIPLES),
         "MJPG": PixelLayout(8, SamplePacking.JPEG),
         "JPEG": PixelLayout(8, SamplePacking.JPEG),
     }
@@ -128,7 +147,7 @@ PREFERRED = (
     *(code for code, layout in LAYOUTS.items() if layout.bayer and layout.bit_depth in (10, 12)),
     *(code for code, layout in LAYOUTS.items() if layout.bayer and layout.bit_depth == 8),
     *(code for code, layout in LAYOUTS.items() if layout.bayer and layout.bit_depth == 16),
-    *("YUYV", "UYVY", "YVYU", "VYUY", "MJPG", "JPEG"),
+    *("YUYV", "UYVY", "YVYU", "VYUY", "NV12", "NV21", "YU12", "YV12", "RGB3", "BGR3", "MJPG", "JPEG"),
 )
 """Order in which formats are preferred: linear before encoded, grey before colour, deep before shallow.
 
@@ -143,10 +162,12 @@ def min_stride_bytes(layout: PixelLayout, size: Size) -> int:
     """Return the bytes of one row of samples without padding; 0 for a compressed format."""
     width = size.width_px
     match layout.packing:
-        case SamplePacking.BYTES:
+        case SamplePacking.BYTES | SamplePacking.PLANE_AND_PAIRS | SamplePacking.PLANES:
             return width
         case SamplePacking.WORDS | SamplePacking.EVEN_BYTES | SamplePacking.ODD_BYTES:
             return 2 * width
+        case SamplePacking.TRIPLES:
+            return 3 * width
         case SamplePacking.MIPI10:
             return (width + 3) // 4 * 5
         case SamplePacking.MIPI12:
@@ -174,12 +195,14 @@ def grey_image(
     Raises
     ------
     CorruptFrameError
-        Bytes are missing, or the JPEG is damaged.
+        Bytes are missing, samples exceed the bit depth, or the JPEG is damaged.
     """
     if layout.packing is SamplePacking.JPEG:
         image = _decode_jpeg(data, size, "GRAY")[..., 0]
+    elif layout.packing is SamplePacking.TRIPLES:
+        image = np.asarray(cv2.cvtColor(_triples(data, layout, size, stride_bytes), cv2.COLOR_BGR2GRAY))
     else:
-        image = _UNPACK[layout.packing](_rows(data, layout, size, stride_bytes), size)
+        image = _samples(data, layout, size, stride_bytes)
     if layout.bayer is not None:
         image = np.asarray(cv2.cvtColor(image, _DEMOSAIC[layout.bayer]))
     if limited_luma and layout.is_luma:
@@ -193,14 +216,14 @@ def colour_image(
     """Convert a buffer of a layout that `has_colour` to (H, W, 3), blue, green, red. See `grey_image`."""
     if layout.packing is SamplePacking.JPEG:
         image = _decode_jpeg(data, size, "BGR")
+    elif layout.packing is SamplePacking.TRIPLES:
+        return _triples(data, layout, size, stride_bytes).copy()
     else:
-        rows = _rows(data, layout, size, stride_bytes)
-        image = _UNPACK[layout.packing](rows, size)
+        image = _samples(data, layout, size, stride_bytes)
         if layout.bayer is not None:
             return np.asarray(cv2.cvtColor(image, getattr(cv2, f"COLOR_Bayer{layout.bayer}2BGR")))
-        first = 1 if layout.packing is SamplePacking.EVEN_BYTES else 0
-        blue, red = (rows[:, first + 2 * (second != layout.red_first) :: 4] for second in (False, True))
-        image = bgr_from_luma(image, blue, red)
+        blue, red = _COLOUR_DIFFERENCES[layout.packing](data, layout, size, stride_bytes)
+        image = bgr_from_luma(image, *((red, blue) if layout.red_first else (blue, red)))
     return _FULL_RANGE[image] if limited_luma else image
 
 
@@ -216,15 +239,75 @@ def bgr_from_luma(luma: Pixels, blue: Bytes, red: Bytes) -> Pixels:
     return np.asarray(cv2.cvtColor(cv2.merge([luma, *planes]), cv2.COLOR_YCrCb2BGR), dtype=np.uint8)
 
 
-def _rows(data: Bytes, layout: PixelLayout, size: Size, stride_bytes: int) -> Bytes:
-    """Return the bytes of each row without padding, (H, smallest stride); the last row may come without padding."""
-    used = min_stride_bytes(layout, size)
+def _plane(data: Bytes, shape: tuple[int, int], stride_bytes: int, first: int = 0) -> Bytes:
+    """Return a view of (rows, bytes) that begin at `first`; the last row may come without its padding."""
+    rows, used = shape
     stride = max(stride_bytes, used)
-    needed = stride * (size.height_px - 1) + used
+    needed = first + stride * (rows - 1) + used
     if len(data) < needed:
         message = f"{len(data)} bytes of {needed} came"
         raise CorruptFrameError(message)
-    return np.lib.stride_tricks.as_strided(data, (size.height_px, used), (stride, 1), writeable=False)
+    return np.lib.stride_tricks.as_strided(data[first:], shape, (stride, 1), writeable=False)
+
+
+def _rows(data: Bytes, layout: PixelLayout, size: Size, stride_bytes: int) -> Bytes:
+    return _plane(data, (size.height_px, min_stride_bytes(layout, size)), stride_bytes)
+
+
+def _samples(data: Bytes, layout: PixelLayout, size: Size, stride_bytes: int) -> Pixels:
+    if layout.packing in _COLOUR_DIFFERENCES:
+        # Whether they are whole: grey images are made of luma alone.
+        _COLOUR_DIFFERENCES[layout.packing](data, layout, size, stride_bytes)
+    image = _UNPACK[layout.packing](_rows(data, layout, size, stride_bytes), size)
+    if layout.packing is not SamplePacking.WORDS or layout.bit_depth == 16:
+        return image
+    image >>= layout.shift
+    largest = int(image.max())
+    if largest >> layout.bit_depth:
+        message = (
+            f"a sample of {largest} came, and {layout.bit_depth} bits hold {2**layout.bit_depth - 1} at most: this "
+            f"receiver stores samples shifted up, as those of Jetson do; write sample_shift = {16 - layout.bit_depth}"
+        )
+        raise CorruptFrameError(message)
+    return image
+
+
+def _triples(data: Bytes, layout: PixelLayout, size: Size, stride_bytes: int) -> Bytes:
+    """Return a view of (H, W, 3), blue, green, red."""
+    image = _rows(data, layout, size, stride_bytes).reshape(*size.shape, 3)
+    return image[..., ::-1] if layout.red_first else image
+
+
+def _from_rows(data: Bytes, layout: PixelLayout, size: Size, stride_bytes: int) -> tuple[Bytes, Bytes]:
+    rows = _rows(data, layout, size, stride_bytes)
+    first = 1 if layout.packing is SamplePacking.EVEN_BYTES else 0
+    return rows[:, first::4], rows[:, first + 2 :: 4]
+
+
+def _from_pairs(data: Bytes, _layout: PixelLayout, size: Size, stride_bytes: int) -> tuple[Bytes, Bytes]:
+    stride = max(stride_bytes, size.width_px)
+    shape = ((size.height_px + 1) // 2, (size.width_px + 1) // 2 * 2)
+    pairs = _plane(data, shape, stride, stride * size.height_px)
+    return pairs[:, ::2], pairs[:, 1::2]
+
+
+def _from_planes(data: Bytes, _layout: PixelLayout, size: Size, stride_bytes: int) -> tuple[Bytes, Bytes]:
+    stride = max(stride_bytes, size.width_px)
+    shape, half, first = (
+        ((size.height_px + 1) // 2, (size.width_px + 1) // 2),
+        (stride + 1) // 2,
+        stride * size.height_px,
+    )
+    return _plane(data, shape, half, first), _plane(data, shape, half, first + half * shape[0])
+
+
+_COLOUR_DIFFERENCES: dict[SamplePacking, Callable[[Bytes, PixelLayout, Size, int], tuple[Bytes, Bytes]]] = {
+    SamplePacking.EVEN_BYTES: _from_rows,
+    SamplePacking.ODD_BYTES: _from_rows,
+    SamplePacking.PLANE_AND_PAIRS: _from_pairs,
+    SamplePacking.PLANES: _from_planes,
+}
+"""Views of the first and the second colour difference of each packing; they raise CorruptFrameError."""
 
 
 def _from_bytes(rows: Bytes, size: Size) -> Pixels:
@@ -257,6 +340,8 @@ def _from_odd_bytes(rows: Bytes, size: Size) -> Pixels:
 
 _UNPACK: dict[SamplePacking, Callable[[Bytes, Size], Pixels]] = {
     SamplePacking.BYTES: _from_bytes,
+    SamplePacking.PLANE_AND_PAIRS: _from_bytes,
+    SamplePacking.PLANES: _from_bytes,
     SamplePacking.WORDS: _from_words,
     SamplePacking.MIPI10: _from_mipi10,
     SamplePacking.MIPI12: _from_mipi12,
@@ -276,8 +361,12 @@ def _decode_jpeg(data: Bytes, size: Size, colorspace: str) -> Pixels:
             return np.asarray(simplejpeg.decode_jpeg(data, colorspace, strict=True))
     except ValueError as error:
         stray = _STRAY_BYTES.search(str(error))
-        if stray is not None and int(stray[1]) <= _MAX_STRAY_BYTES:
-            return np.asarray(simplejpeg.decode_jpeg(data, colorspace, strict=False))
+        if stray is not None:
+            count = int(stray[1])
+            if count <= _MAX_STRAY_BYTES or not _before_end(data, count).any():
+                return np.asarray(simplejpeg.decode_jpeg(data, colorspace, strict=False))
+            message = f"{count} bytes are between the last block of the JPEG and its end"
+            raise PaddedFrameError(message) from error
         if _NO_END in str(error) and data[-2:].tobytes() != _JPEG_END:
             # Some cameras leave the end marker out; data that end early are found with it, too.
             return _decode_jpeg(np.append(data, np.frombuffer(_JPEG_END, np.uint8)), size, colorspace)
@@ -285,3 +374,9 @@ def _decode_jpeg(data: Bytes, size: Size, colorspace: str) -> Pixels:
         raise CorruptFrameError(message) from error
     message = f"the JPEG decodes to {width_px} x {height_px}, expected {size}"
     raise CorruptFrameError(message)
+
+
+def _before_end(data: Bytes, count: int) -> Bytes:
+    """Return the bytes before the last end marker."""
+    end = data.tobytes().rfind(_JPEG_END)
+    return data[max(end - count, 0) : end]

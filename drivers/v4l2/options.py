@@ -32,6 +32,10 @@ class V4L2Options(Strict, use_attribute_docstrings=True):
     bit_depth: Annotated[int, Field(ge=8, le=16)] | None = None
     """Number of low bits of a 16-bit sample that the sensor fills (Y16 and 16-bit Bayer only); else all."""
 
+    sample_shift: Annotated[int, Field(ge=0, le=8)] = 0
+    """Bits by which samples are shifted up in their 16-bit words (10 to 14 bits), the bits below repeating the upper
+    ones: 6 for 10 bits on Jetson Xavier and Orin (NVIDIA's technical reference, "RAW pixel formatting to memory")."""
+
     limited_luma: bool = False
     """True if the camera sends luma as 16 to 235 (YUV formats): it is expanded to 0 to 255."""
 

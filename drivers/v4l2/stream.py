@@ -11,7 +11,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from fractions import Fraction
 from functools import partial
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.v4l2 import kernel
-from drivers.v4l2.formats import LAYOUTS, PREFERRED, PixelLayout
+from drivers.v4l2.formats import LAYOUTS, PREFERRED, PixelLayout, SamplePacking
 from drivers.v4l2.options import V4L2Options
 from slrig.errors import DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Size
@@ -225,6 +225,14 @@ def _reaches(rate_hz: float, wanted_hz: float) -> bool:
 
 def _layout(code: str, options: V4L2Options, node: Path) -> PixelLayout:
     layout = LAYOUTS[code]
+    if options.sample_shift:
+        if layout.packing is not SamplePacking.WORDS or layout.bit_depth == 16:
+            message = (
+                f"{node}: requested sample_shift {options.sample_shift}, but {code.strip()} has no samples of 10 to 14 "
+                "bits in 16-bit words; leave sample_shift out"
+            )
+            raise UnsupportedByDeviceError(message)
+        layout = replace(layout, shift=options.sample_shift)
     if options.bit_depth is None or options.bit_depth == layout.bit_depth:
         return layout
     if layout.bit_depth != 16:
@@ -233,7 +241,7 @@ def _layout(code: str, options: V4L2Options, node: Path) -> PixelLayout:
             "bit_depth out, it is for 16-bit formats that the sensor does not fill"
         )
         raise UnsupportedByDeviceError(message)
-    return PixelLayout(options.bit_depth, layout.packing, layout.bayer)
+    return replace(layout, bit_depth=options.bit_depth)
 
 
 def _require_format(handle: int, node: Path, code: str, size: Size, pix: kernel.PixFormat) -> None:

@@ -21,9 +21,10 @@ from slrig.errors import (
     UnsupportedByDeviceError,
 )
 from slrig.model import Pixels
+from tests.contract import v4l2_sensor
 from tests.contract.stage import Stage
 from tests.contract.v4l2_bench import CAMERA, CONTROLS, Faked, VirtualDevice, control, virtually
-from tests.contract.v4l2_sensor import GAIN_UNITS
+from tests.contract.v4l2_sensor import GAIN_UNITS, encoded
 from tests.unit.capture.fake_rig import Scene
 from tests.unit.drivers.v4l2.conftest import Plug
 from tests.virtual_clock import VirtualClock
@@ -59,6 +60,7 @@ def armed(device: VirtualDevice, settings: CameraSettings | None = None, **optio
         ({"pixel_format": "Y10", "size_px": [1280, 720]}, "requested Y10 1280 x 720, driver gives Y10 80 x 60"),
         ({"frame_rate_hz": 60.0}, "requested 60 frames per second, driver gives 50"),
         ({"bit_depth": 9}, "Y10 has 10 bits"),
+        ({"sample_shift": 6, "pixel_format": "YUYV"}, "YUYV has no samples of 10 to 14 bits"),
         ({"controls": {"brightness": 3, "gama": 1}}, "control 'gama', the device has: auto_exposure, backlight"),
         ({"skip_controls": ["sharpnes"]}, r"control 'sharpnes', the device has: auto_exposure, .*sharpness"),
         ({"device": "/dev/null"}, "is not a video device"),
@@ -426,6 +428,22 @@ def test_a_cut_frame_is_corrupt_without_a_flag(plugged: Plug, code: str) -> None
     frames = [camera.read(0, 2) for _ in range(10)]
     assert frames[-1].dropped_count > 0
     assert all(np.abs(frame.image.astype(float) - frames[0].image).max() < 9 for frame in frames)
+
+
+def test_a_camera_that_pads_every_frame_is_called_so(plugged: Plug, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(v4l2_sensor, "encoded", lambda *sent: (data := encoded(*sent))[:-2] + b"U" * 400 + data[-2:])
+    camera = armed(plugged(Faked(formats={"MJPG": SIZES}), virtually(code="MJPG")))
+    with pytest.raises(FrameTimeoutError, match=r"39. bytes are between .*\. This camera pads its frames: all [1-9]"):
+        camera.read(0, 1)
+
+
+def test_samples_that_the_receiver_shifts_up_are_read(plugged: Plug, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(v4l2_sensor, "encoded", lambda image, *sent: encoded(image << 6, *sent))
+    stage = virtually(code="Y10 ")
+    stage.show(WHITE)
+    camera = armed(plugged(Faked(formats={"Y10 ": SIZES}), stage), sample_shift=6)
+    assert camera.info.format.bit_depth == 10
+    np.testing.assert_array_equal(camera.read(0, 2).image, stage.expected(WHITE, exposure_s=0.002))
 
 
 def test_lost_frames_are_counted_and_idle_ones_are_not(plugged: Plug) -> None:

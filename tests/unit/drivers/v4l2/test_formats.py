@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -79,6 +80,68 @@ def test_a_mosaic_under_one_colour_has_that_colours_brightness(bayer: str, bit_d
         layout = PixelLayout(bit_depth, packing, bayer)
         image = grey_image(data, layout, size, stride_bytes=min_stride_bytes(layout, size))
         np.testing.assert_allclose(image[2:-2, 2:-2], weight * full, atol=2 + 0.002 * full)
+
+
+def planar(code: str, size: Size, stride: int) -> tuple[bytes, Pixels, Pixels]:
+    """A frame of random samples in planes, by V4L2's documents: its bytes, grey and colour image."""
+    rng = np.random.default_rng(1)
+    half = (-(-size.height_px // 2), -(-size.width_px // 2))
+    luma = rng.integers(60, 190, size.shape, np.uint8)
+    blue, red = (rng.integers(112, 144, half, np.uint8) for _ in range(2))
+
+    def padded(rows: Pixels, width: int) -> bytes:
+        return np.pad(rows, ((0, 0), (0, width - rows.shape[1])), constant_values=0xEE).tobytes()
+
+    first, second = (red, blue) if code in {"NV21", "YV12"} else (blue, red)
+    pairs = np.stack([first, second], axis=-1).reshape(half[0], -1)
+    rest = padded(pairs, stride) if code.startswith("NV") else padded(first, stride // 2) + padded(second, stride // 2)
+    y, cb, cr = (
+        luma.astype(float),
+        *(each.repeat(2, 0).repeat(2, 1)[: size.height_px, : size.width_px] - 128.0 for each in (blue, red)),
+    )
+    # JFIF's matrix.
+    colour = np.stack([y + 1.772 * cb, y - 0.344136 * cb - 0.714136 * cr, y + 1.402 * cr], axis=-1)
+    return padded(luma, stride) + rest, luma, np.rint(colour).astype(np.uint8)
+
+
+@pytest.mark.parametrize("code", ["NV12", "NV21", "YU12", "YV12"])
+@pytest.mark.parametrize("stride", [32, 38])
+def test_planes_give_grey_and_colour(code: str, stride: int) -> None:
+    size, layout = Size(32, 24), LAYOUTS[code]
+    sent, luma, colour = planar(code, size, stride)
+    data = np.frombuffer(sent, np.uint8)
+    np.testing.assert_array_equal(grey_image(data, layout, size, stride_bytes=stride), luma)
+    seen = colour_image(data, layout, size, stride_bytes=stride).astype(int)
+    np.testing.assert_allclose(seen, colour, atol=1)
+    for read in (grey_image, colour_image):
+        with pytest.raises(CorruptFrameError, match="bytes of"):
+            read(data[: -stride // 2], layout, size, stride_bytes=stride)
+
+
+@pytest.mark.parametrize("padding", [0, 5])
+@pytest.mark.parametrize("code", ["RGB3", "BGR3"])
+def test_triples_give_grey_and_colour(code: str, padding: int) -> None:
+    size = Size(13, 6)
+    colour = np.random.default_rng(2).integers(0, 256, (*size.shape, 3), np.uint8)
+    rows = (colour[..., ::-1] if code == "RGB3" else colour).reshape(6, -1)
+    data = np.frombuffer(np.pad(rows, ((0, 0), (0, padding))).tobytes(), np.uint8)
+    stride = 39 + padding
+    np.testing.assert_array_equal(colour_image(data, LAYOUTS[code], size, stride_bytes=stride), colour)
+    grey = grey_image(data, LAYOUTS[code], size, stride_bytes=stride)
+    np.testing.assert_allclose(grey.astype(float), colour @ [0.114, 0.587, 0.299], atol=1)
+
+
+@pytest.mark.parametrize(("code", "bits"), [("Y10 ", 10), ("Y12 ", 12), ("RG10", 10)])
+def test_samples_that_are_shifted_up_come_down_or_are_refused(code: str, bits: int) -> None:
+    size, shift = Size(8, 4), 16 - bits
+    samples = np.full(size.shape, 0x155, np.uint16)
+    # By NVIDIA's technical reference: the upper bits again below the sample.
+    sent = (samples << shift | samples >> (bits - shift)).astype("<u2")
+    data = np.frombuffer(sent.tobytes(), np.uint8)
+    shifted = replace(LAYOUTS[code], shift=shift)
+    np.testing.assert_array_equal(grey_image(data, shifted, size, stride_bytes=16), samples)
+    with pytest.raises(CorruptFrameError, match=f"write sample_shift = {shift}"):
+        grey_image(data, LAYOUTS[code], size, stride_bytes=16)
 
 
 def test_the_kernels_names_of_mosaics_are_not_confused() -> None:

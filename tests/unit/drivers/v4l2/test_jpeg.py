@@ -93,6 +93,13 @@ def test_a_few_bytes_behind_the_last_block_are_usual_and_many_are_not() -> None:
             assert (fault_of(frame) == "") is whole
 
 
+def test_zeros_before_the_end_are_padding_however_many() -> None:
+    data = bytes(picture())
+    for count in (24, 608, 5000):
+        assert fault_of(np.frombuffer(data[:-2] + bytes(count) + data[-2:], np.uint8)) == ""
+        assert "bytes are between" in fault_of(np.frombuffer(data[:-2] + bytes(count) + b"\1" + data[-2:], np.uint8))
+
+
 def test_restart_markers_out_of_turn_and_a_cut_are_found() -> None:
     data = bytearray(bytes(picture("restarts")))
     data[data.index(b"\xff\xd3") + 1] = 0xD5
