@@ -4,7 +4,8 @@
     driver = "serial_projector"
     port = "usb-MicroPython_Board_in_FS_mode_e66-if00"     # as slrig devices lists it; other options: options.py
 
-The protocol below is sufficient to write firmware for another box. `device/` has a reference in MicroPython.
+The protocol below is sufficient to write firmware for another box. `device/` has a reference in MicroPython, and
+`device/arduino/` the same in C.
 
 The line
 --------
@@ -74,6 +75,8 @@ dim so far answers ERR 4 bright 1000. Its answer contains
     gap_us= hold_us= least_us=   least time from one exposure's end to the next; how long a pattern of a sequence stays
                                  lit beyond its exposure; shortest exposure
     pick=                        maximum patterns of PICK; a box without this word has no PICK, and loads runs only
+    pulse=exposure               the cameras' pulse lasts as long as the exposure, for cameras that expose for its
+                                 length; without this word it has a length of the box's own
 
 gap_us in HELLO is for patterns in the order of the flash; LOAD returns that of the sequence, longer if it steps back.
 
@@ -119,7 +122,8 @@ own clock, µs; `>` is to the box, `<` from it, and a line that begins with `|` 
 
        1000 > 1A2B 1 HELLO 1 2000 60000 1000 1000*0F42
             < 1A2B 1 OK sltp=1 model=example fw=1.0 w=4 h=2 max=3 boot=00C0FFEE watchdog_ms=2000 on_ms=60000
-            | duty=1000 bright=1000 light_us=2000 error_us=50 gap_us=3000 hold_us=500 least_us=200 pick=512*DC8B
+            | duty=1000 bright=1000 light_us=2000 error_us=50 gap_us=3000 hold_us=500 least_us=200 pick=512
+            | pulse=exposure*6739
        2000 > 1A2B 2 PING*8724
             < 1A2B 2 OK 2000 idle 0*2536
        3000 > 1A2B 3 LOAD 3 027B77B3*9533

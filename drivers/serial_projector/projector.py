@@ -25,8 +25,10 @@ from slrig.devices import Clock, DisplayedPattern, ProjectorInfo, ProjectorState
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 
-DESCRIPTION = "patterns.json"
-"""File that describes a pattern set to the box."""
+DESCRIPTION, HEADER = "patterns.json", "patterns.h"
+"""Files that describe a pattern set to a box: the Pico reads the first, the Arduino's program is compiled with the
+other.
+"""
 
 _FAULTS = {
     BoxFault.WATCHDOG: "it received nothing from this host for watchdog_s: the host was too busy or the cable is bad; "
@@ -138,8 +140,9 @@ class SerialProjector:
         folder = self._export_folder / f"{crc32:08X}"
         export_patterns(sequence, folder)
         return (
-            f"{len(sequence)} images and patterns.json are in {folder}: put the images into the light engine's memory, "
-            "in the order of their numbers, and patterns.json onto the box"
+            f"{len(sequence)} images, {DESCRIPTION} and {HEADER} are in {folder}: put the images into the light "
+            f"engine's memory, in the order of their numbers, and {DESCRIPTION} onto the box (a Pico), or {HEADER} "
+            "beside its main.c (an Arduino)"
         )
 
     def show(self, index: int) -> DisplayedPattern:
@@ -308,7 +311,7 @@ def _fault_message(port: str, words: tuple[str, ...]) -> str:
 
 
 def export_patterns(sequence: PatternSequence, folder: Path) -> None:
-    """Write the images for the light engine's flash, `000.png` …, and `patterns.json` for the box.
+    """Write the images for the light engine's flash, `000.png` …, and `patterns.json` and `patterns.h` for the box.
 
     Raises DeviceError if the folder cannot be written, UnsupportedByDeviceError if a pattern has more than 8 bits.
     """
@@ -328,6 +331,9 @@ def export_patterns(sequence: PatternSequence, folder: Path) -> None:
                 raise DeviceError(message)
             (folder / f"{index:03d}.png").write_bytes(png.tobytes())
         (folder / DESCRIPTION).write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
+        table = ", ".join(f"0x{crc32:08X}" for crc32 in checksums)
+        header = f"#define WIDTH_PX {size.width_px}\n#define HEIGHT_PX {size.height_px}\n#define PATTERNS {table}\n"
+        (folder / HEADER).write_text(header, encoding="utf-8")
     except OSError as error:
         message = f"export_folder: {folder} cannot be written ({error}); name another folder"
         raise DeviceError(message) from error

@@ -249,6 +249,9 @@ def test_the_rig_file_of_the_readme_is_one(tmp_path: Path) -> None:
 @pytest.mark.parametrize("pin", ["STEP", "HOME", "LAMP", "CAMERA", "READY", "SERVICE"])
 def test_the_wiring_of_the_readme_is_that_of_the_firmware(pin: str) -> None:
     assert f"| GP{getattr(box, f'{pin}_PIN')} | {pin}, " in README
+    on_arduino = {f"PD{number}": f"D{number}" for number in range(8)} | {"PB1": "D9"}
+    port = re.search(rf"\b{pin} = (P[BD]\d)", (Path(box.__file__).parent / "arduino" / "main.c").read_text())
+    assert re.search(rf"\| {pin}, \w+ \| {on_arduino[port[1]] if port else '–'} \|", README)
     assert "912 × 1140" in README
     assert (box.WIDTH_PX, box.HEIGHT_PX) == (912, 1140)
 

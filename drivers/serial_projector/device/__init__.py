@@ -8,4 +8,7 @@ Copy them unchanged to the box, with the `patterns.json` that the driver writes 
 
 `python -c "import drivers.serial_projector.device as box; print(*box.__path__)"` prints their folder. For another
 engine, write another `main.py` that implements `box.BoxHardware`.
+
+The folder arduino is the same box in C for an Arduino Uno or Nano (ATmega328P at 16 MHz): protocol.c is the protocol,
+main.c the pins. "make flash" compiles them with the patterns.h that the driver writes, and puts them onto the board.
 """

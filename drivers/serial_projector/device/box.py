@@ -36,8 +36,8 @@ class BoxHardware:
         """Switch the light off, and return when it is off."""
         raise NotImplementedError
 
-    def pulse(self) -> None:
-        """Begin one trigger pulse to the cameras."""
+    def pulse(self, us: int) -> None:
+        """Begin one trigger pulse to the cameras, which lasts for an exposure of so many µs."""
         raise NotImplementedError
 
     def set_brightness(self, permille: int) -> int:

@@ -26,7 +26,7 @@ except ImportError:
     from box import BoxDescription, BoxHardware, HardwareError  # type: ignore[no-redef]
     from protocol import TriggerBox  # type: ignore[no-redef]
 
-MODEL, FIRMWARE = "slrig-pico", "1.1.0"
+MODEL, FIRMWARE = "slrig-pico", "1.2.0"
 WIDTH_PX, HEIGHT_PX = 912, 1140
 
 STEP_PIN, HOME_PIN, LAMP_PIN, CAMERA_PIN, READY_PIN, SERVICE_PIN = 2, 3, 4, 5, 6, 15
@@ -49,8 +49,11 @@ READY_US = 20000
 LAMP_US = 20
 """Delay from LAMP to light."""
 
-PULSE_US = 100
-"""Length of the cameras' trigger pulse."""
+CAMERA_LEVEL = 1
+"""Level of the cameras' pulse, which lasts as long as the exposure: 0 for XTR of a Raspberry Pi camera."""
+
+PULSE_LESS_US = 14
+"""How much shorter than the exposure it is: an IMX296 exposes for its low level and 14.26 µs."""
 
 HOLD_US = 500
 """How long a pattern of a sequence stays lit beyond its exposure: longer than the largest delay of this program."""
@@ -136,9 +139,10 @@ class PicoBoard(BoxHardware):
         self._lamp.duty_u16(0)
         self._time.sleep_us(LAMP_US)
 
-    def pulse(self) -> None:
+    def pulse(self, us: int) -> None:
         """See `BoxHardware`. The state machine ends it, without waiting."""
-        self._camera.put(PULSE_US)
+        # Beside the turns of its loop, it takes 1 µs before and 1 µs behind.
+        self._camera.put(us - PULSE_LESS_US - 2)
 
     def set_brightness(self, permille: int) -> int:
         """See `BoxHardware`."""
@@ -155,14 +159,15 @@ class PicoBoard(BoxHardware):
 def _pulses(machine, rp2):
     """Return a state machine that makes a pulse of the given number of µs."""
 
-    @rp2.asm_pio(set_init=rp2.PIO.OUT_LOW)
-    def program() -> None:
+    @rp2.asm_pio(set_init=rp2.PIO.OUT_LOW if CAMERA_LEVEL else rp2.PIO.OUT_HIGH)
+    def program(level=CAMERA_LEVEL, at_rest=1 - CAMERA_LEVEL) -> None:
+        # MicroPython takes the module's names away while it assembles this.
         pull(block)
         mov(x, osr)
-        set(pins, 1)
+        set(pins, level)
         label("on")
         jmp(x_dec, "on")
-        set(pins, 0)
+        set(pins, at_rest)
 
     camera = rp2.StateMachine(0, program, freq=1000000, set_base=machine.Pin(CAMERA_PIN))
     camera.active(1)

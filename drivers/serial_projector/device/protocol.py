@@ -146,7 +146,7 @@ class TriggerBox:
         """Light the selected pattern of a sequence, and trigger the cameras."""
         first, _, exposure_us, _ = self._sequence
         t_us = self._light()
-        self._hardware.pulse()
+        self._hardware.pulse(exposure_us)
         self._off_us = self._hardware.time_us() + exposure_us + self._description.hold_us
         self._index = first + self._frames
         self._frames += 1
@@ -250,7 +250,7 @@ class TriggerBox:
             f"sltp={wire.VERSION} model={about.model} fw={about.firmware} w={about.width_px} h={about.height_px} "
             f"max={about.count} boot={self._boot:08X} watchdog_ms={watchdog_ms} on_ms={on_ms} duty={duty} "
             f"bright={granted} light_us={about.light_us} error_us={about.error_us} gap_us={about.gap_us} "
-            f"hold_us={about.hold_us} least_us={about.least_us} pick={MAX_PICKED}"
+            f"hold_us={about.hold_us} least_us={about.least_us} pick={MAX_PICKED} pulse=exposure"
         )
 
     def _ping(self) -> str:

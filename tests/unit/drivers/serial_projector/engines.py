@@ -87,7 +87,7 @@ class FakeLight(BoxHardware):
         self._maybe("dark")
         self._scene.change(None, self._boot)
 
-    def pulse(self) -> None:
+    def pulse(self, us: int) -> None:  # noqa: ARG002 - its scene has no cameras that it could expose
         self._maybe("pulse")
         self._scene.pulse()
 

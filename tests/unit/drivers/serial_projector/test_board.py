@@ -26,6 +26,7 @@ class Pico:
         self.did: list[tuple[int, str]] = []
         self.levels: dict[int, int] = {}
         self.program: list[tuple[object, ...]] = []
+        self.at_rest = -1
         board = self
 
         class Pin:
@@ -94,10 +95,11 @@ class Pico:
         class PIO:
             """Its levels."""
 
-            OUT_LOW = 0
+            OUT_LOW, OUT_HIGH = 0, 1
 
-        def asm_pio(**options: int) -> object:
-            assert options == {"set_init": PIO.OUT_LOW}
+        def asm_pio(*, set_init: int) -> object:
+            board.at_rest = set_init
+            board.program = []
 
             def assembled(program) -> object:  # type: ignore[no-untyped-def]  # noqa: ANN001
                 def word(name: str):  # type: ignore[no-untyped-def]  # noqa: ANN202
@@ -105,6 +107,7 @@ class Pico:
 
                 known = program.__globals__
                 kept = dict(known)
+                known.clear()
                 for name in ("pull", "mov", "set", "label", "jmp"):
                     known[name] = word(name)
                 for name in ("block", "x", "osr", "pins", "x_dec"):
@@ -200,14 +203,20 @@ def test_light_follows_the_lamp_and_its_brightness(pico: Pico, board: main.PicoB
     assert pico.levels[main.LAMP_PIN] == FULL // 4
 
 
-def test_the_cameras_get_a_pulse_of_its_length(pico: Pico, board: main.PicoBoard) -> None:
-    for _ in range(2):
+@pytest.mark.parametrize("level", [1, 0])
+def test_the_cameras_get_a_pulse_as_long_as_the_exposure(
+    pico: Pico, level: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(main, "CAMERA_LEVEL", level)
+    board = main.PicoBoard(pico.machine, pico.rp2, pico.time)
+    assert pico.at_rest == 1 - level
+    for us in (200, 5_000):
         pico.did.clear()
-        board.pulse()
-        (up_us, up), (down_us, down) = pico.did
-        assert (up, down) == (f"{main.CAMERA_PIN}=1", f"{main.CAMERA_PIN}=0")
-        # The loop's last turn and the instruction that ends it.
-        assert down_us - up_us == pytest.approx(main.PULSE_US, abs=2)
+        board.pulse(us)
+        (begin_us, begun), (end_us, ended) = pico.did
+        assert (begun, ended) == (f"{main.CAMERA_PIN}={level}", f"{main.CAMERA_PIN}={1 - level}")
+        # The sensor adds 14.26 µs.
+        assert end_us - begin_us == us - 14
 
 
 def test_its_time_never_wraps(pico: Pico, board: main.PicoBoard) -> None:

@@ -1,12 +1,19 @@
-"""The reference core on a clock that the test moves: at most once, in one session, and dark when it must be."""
+"""A box's core on a clock that the test moves: at most once, in one session, and dark when it must be.
+
+The core is the reference, the same in MicroPython's interpreter, or the Arduino's on its processor in a simulator: the
+results are the same.
+"""
 
 from __future__ import annotations
 
 import inspect
 import re
 import zlib
+from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any, ClassVar
 
 import pytest
 
@@ -25,6 +32,8 @@ from drivers.serial_projector.link import (
     encode_line,
     parse_line,
 )
+from tests.unit.drivers.serial_projector import remote
+from tests.unit.drivers.serial_projector.remote import RemoteBox
 
 CRC32 = [zlib.crc32(bytes([number])) for number in range(26)]
 WATCHDOG_US, ON_US = 1_000_000, 5_000_000
@@ -55,8 +64,8 @@ class Light(BoxHardware):
     def switch_off(self) -> None:
         self._do("dark")
 
-    def pulse(self) -> None:
-        self._do("pulse")
+    def pulse(self, us: int) -> None:
+        self._do("pulse", str(us))
 
     def set_brightness(self, permille: int) -> int:
         return permille if self.dims else 1000
@@ -84,10 +93,12 @@ class Light(BoxHardware):
 class Host:
     """Sends lines to a core, and reads what comes back."""
 
+    make_box: ClassVar[staticmethod[[BoxHardware, BoxDescription, int], TriggerBox | RemoteBox]]
+
     def __init__(self, *, crc32: list[int] | None = None, **about: int) -> None:
         self.light = Light()
         limits = {"light_us": 2_000, "error_us": 50, "gap_us": 3_000, "hold_us": 500, "least_us": 200, **about}
-        self.box = TriggerBox(self.light, BoxDescription("test", "1", 4, 2, crc32 or CRC32, **limits), 0xB007)
+        self.box = self.make_box(self.light, BoxDescription("test", "1", 4, 2, crc32 or CRC32, **limits), 0xB007)
         self.number = 0
         self.events: list[BoxEvent] = []
 
@@ -141,6 +152,27 @@ class Host:
             self.events.append(found)
         else:
             answers.append(found)
+
+
+CORES = [
+    TriggerBox,
+    pytest.param(remote.micropython, marks=pytest.mark.slow),
+    pytest.param(remote.arduino, marks=pytest.mark.slow),
+]
+
+
+@pytest.fixture(params=CORES, ids=["reference", "MicroPython", "Arduino"], autouse=True)
+def make_box(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    with ExitStack() as made:
+
+        def make(*how: Any) -> TriggerBox | RemoteBox:
+            box: TriggerBox | RemoteBox = request.param(*how)
+            if isinstance(box, RemoteBox):
+                made.callback(box.close)
+            return box
+
+        monkeypatch.setattr(Host, "make_box", staticmethod(make), raising=False)
+        yield
 
 
 @pytest.fixture
@@ -431,7 +463,7 @@ def test_a_sequence_waits_for_triggers(host: Host) -> None:
     assert host.events[-1] == BoxEvent("DONE", ("3",))
     assert host.refused("TRIG") == RefusalCode.STATE
     assert host.light.shown == [4, 5, 6]
-    assert host.light.did.count("pulse") == 3
+    assert host.light.did.count("pulse 4000") == 3
 
 
 # What is loaded.
@@ -538,7 +570,7 @@ def test_the_pages_example_is_what_the_reference_box_answers() -> None:
         "example", "1.0", 4, 2, crc32, light_us=2000, error_us=50, gap_us=3000, hold_us=500, least_us=200
     )
     light = Light(now_us=0, takes_us=20)
-    box = TriggerBox(light, about, 0xC0FFEE)
+    box = Host.make_box(light, about, 0xC0FFEE)
     waiting: list[str] = []
     for time_us, direction, text in example():
         if time_us is not None:
