@@ -4,6 +4,7 @@ Needs the extra `picamera2` and the system's `python3-libcamera`. Written from t
 libcamera's documentation, and tested with a stand-in for the library, not yet on a Raspberry Pi.
 
 - https://github.com/raspberrypi/picamera2 (`Picamera2`, `CompletedRequest`, `Job`)
+- https://www.raspberrypi.com/documentation/accessories/camera.html (external trigger of the GS camera)
 - https://libcamera.org/api-html/namespacelibcamera_1_1controls.html (controls and metadata)
 """
 

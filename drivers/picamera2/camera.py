@@ -1,6 +1,8 @@
 """A Raspberry Pi's camera through picamera2.
 
-The sensor runs freely, so `read` waits for a frame whose exposure began late enough. Settings are written while it is
+A free-running sensor is read until a frame comes whose exposure began late enough. One that is triggered by wire (XTR
+of an IMX296) exposes for as long as the pulse lasts, so its frames state the exposure that was requested, and all of
+them are kept. Settings are written while it is
 stopped: then the first frame has them. Each frame's metadata contain its exposure, its gain and the time from the frame
 before; a longer time between two stamps means that frames were lost or not fetched.
 """
@@ -8,11 +10,13 @@ before; a longer time between two stamps means that frames were lost or not fetc
 from __future__ import annotations
 
 import importlib
+import math
 import re
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import TimeoutError as JobTimeoutError
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -40,6 +44,7 @@ from slrig.errors import (
     DeviceBusyError,
     DeviceError,
     DeviceGoneError,
+    DeviceStateError,
     FrameTimeoutError,
     UnsupportedByDeviceError,
 )
@@ -66,6 +71,9 @@ class PiCameraOptions(Strict, use_attribute_docstrings=True):
 
     global_shutter: bool = False
     """True if the sensor exposes all rows together (IMX296, OV9281), which libcamera does not report."""
+
+    external_trigger: bool = False
+    """Each pulse of a trigger box on XTR is one exposure, as long as the pulse (IMX296, the global-shutter camera)."""
 
     time_stamp: Literal["readout", "exposure"] = "readout"
     """Meaning of a time stamp: the start of the first row's readout, which is the end of its exposure (Raspberry Pi's
@@ -100,6 +108,13 @@ _SETTING_TOLERANCE = 0.01
 _SETTLING_FRAMES = 12
 _WAIT_SLICE_S = 0.05
 _FRAME_TIMEOUT_S = 3.0
+TRIGGER_MODE = Path("/sys/module/imx296/parameters/trigger_mode")
+"""The kernel's switch of all IMX296: 1 for exposures by XTR."""
+_TRIGGERED_SENSOR = "imx296"
+_WIRED_BUFFERS = 12
+_WIRED_AHEAD = 10
+"""Frames that may wait for `read` while pulses go on."""
+_SHORTEST_PULSE_S = 50e-6
 _SUSPENDED_NS = 1_000_000
 
 
@@ -175,8 +190,30 @@ class PiStream:
         return grey_image(data, self.layout, self.size, stride_bytes=self.stride_bytes)
 
 
-def configure_stream(camera: Any, name: str, *, raw: bool, size_px: tuple[int, int] | None) -> PiStream:
-    """Configure the camera for a stream and read the result back.
+def require_trigger_mode(name: str, model: str, *, external: bool) -> None:
+    """Raise UnsupportedByDeviceError unless the sensor is switched to what is requested: pulses on XTR, or none."""
+    if model != _TRIGGERED_SENSOR:
+        if external:
+            message = (
+                f"camera '{name}': requested external_trigger, which sensor {_TRIGGERED_SENSOR} has, and this is "
+                f"{model}; leave external_trigger out"
+            )
+            raise UnsupportedByDeviceError(message)
+        return
+    waits = TRIGGER_MODE.is_file() and TRIGGER_MODE.read_text(encoding="ascii").strip() == "1"
+    if waits != external:
+        found = "waits for pulses on XTR" if waits else "runs freely"
+        message = (
+            f"camera '{name}': requested external_trigger = {str(external).lower()}, and the kernel's driver {found}; "
+            f"echo {int(external)} | sudo tee {TRIGGER_MODE}, or write external_trigger = {str(waits).lower()}"
+        )
+        raise UnsupportedByDeviceError(message)
+
+
+def configure_stream(
+    camera: Any, name: str, *, raw: bool, size_px: tuple[int, int] | None, buffers: int | None = None
+) -> PiStream:
+    """Configure the camera for a stream and read the result back. buffers : as many as the library makes if None.
 
     Raises
     ------
@@ -192,10 +229,13 @@ def configure_stream(camera: Any, name: str, *, raw: bool, size_px: tuple[int, i
         raise UnsupportedByDeviceError(message)
     mode = max((mode for mode in modes if tuple(mode["size"]) == wanted), key=lambda mode: mode["bit_depth"])
     sensor = {"output_size": wanted, "bit_depth": mode["bit_depth"]}
+    table: dict[str, Any]
     if raw:
         table = {"raw": {"format": mode["unpacked"], "size": wanted}, "main": {"size": _MIN_MAIN_SIZE}}
     else:
         table = {"main": {"format": "YUV420", "size": wanted}}
+    if buffers is not None:
+        table["buffer_count"] = buffers
     camera.configure(camera.create_video_configuration(**table, sensor=sensor, controls={}, display=None, encode=None))
     which = "raw" if raw else "main"
     got = camera.camera_configuration()[which]
@@ -259,13 +299,18 @@ class PiCamera:
             found = ", ".join(each["Id"] for each in known) or "none"
             message = f"camera '{name}': camera '{options.device}' is not connected; found: {found}; check its cable"
             raise DeviceGoneError(message)
-        self._job: Any = None
+        self._jobs: deque[Any] = deque()
+        self._applied: AppliedSettings | None = None
+        wired = self._wired = options.external_trigger
+        require_trigger_mode(name, str(known[numbers[0]]["Model"]), external=wired)
         with translate_errors(name, "opening it"):
             self._camera = load_library()(numbers[0])
         try:
             with translate_errors(name, "configuring it"):
                 raw = options.pixels == "raw"
-                self._stream: PiStream = configure_stream(self._camera, name, raw=raw, size_px=options.size_px)
+                self._stream: PiStream = configure_stream(
+                    self._camera, name, raw=raw, size_px=options.size_px, buffers=_WIRED_BUFFERS if wired else None
+                )
                 self._controls = self._camera.camera_controls
                 self._camera.set_controls(self._fixed_controls())
             self._info = self._describe(known[numbers[0]])
@@ -279,7 +324,7 @@ class PiCamera:
         return self._info
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        """See `Camera`. Runs the camera until a frame with these settings comes.
+        """See `Camera`. Runs the camera until a frame with these settings comes, unless it waits for pulses.
 
         Raises
         ------
@@ -287,6 +332,12 @@ class PiCamera:
             The camera delivers no frame.
         """
         self._state.check_settings(settings, self._info)
+        if self._wired:
+            fastest_us = self._set_exposure(settings.exposure_s, settings.gain)
+            # The sensor is read out before the next exposure begins.
+            period_s = settings.exposure_s + fastest_us / 1e6
+            self._applied = AppliedSettings(settings.exposure_s, settings.gain, period_s)
+            return self._applied
         metadata = self._run_until_applied(settings.exposure_s, settings.gain, _SETTLING_FRAMES)
         got = _applied_settings(metadata)
         if not _is_applied(metadata, settings.exposure_s, settings.gain):
@@ -303,6 +354,7 @@ class PiCamera:
         self._last_ns = self._number = self._dropped = 0
         with translate_errors(self._name, "starting it"):
             self._camera.start()
+            self._request(_WIRED_AHEAD if self._wired else 0)
         self._state.armed = trigger
 
     def trigger(self) -> None:
@@ -331,7 +383,8 @@ class PiCamera:
             if left_s <= 0:
                 message = (
                     f"camera '{self._name}': no frame that began after {after_ns} ns came in {timeout_s:g} s "
-                    f"({skipped} that began earlier were skipped); check its cable, and that the Pi keeps up"
+                    f"({skipped} that began earlier were skipped); check "
+                    + ("the wire to XTR, its level, and R11" if self._wired else "its cable, and that the Pi keeps up")
                 )
                 raise FrameTimeoutError(message)
 
@@ -355,13 +408,8 @@ class PiCamera:
         FrameTimeoutError
             It delivers no frame.
         """
-        exposure_us = round(exposure_s * 1e6)
-        fastest_us = self._controls["FrameDurationLimits"][0]
-        limits = (fastest_us, max(fastest_us, exposure_us + _BLANK_US))
         with translate_errors(self._name, "setting exposure and gain"):
-            self._camera.set_controls(
-                {"ExposureTime": exposure_us, "AnalogueGain": gain, "FrameDurationLimits": limits}
-            )
+            self._set_exposure(exposure_s, gain)
             self._camera.start()
             try:
                 while True:
@@ -377,22 +425,42 @@ class PiCamera:
             finally:
                 self._stop()
 
+    def _set_exposure(self, exposure_s: float, gain: float) -> int:
+        """Set exposure and gain for the next start; return the shortest frame duration, µs."""
+        exposure_us = round(exposure_s * 1e6)
+        fastest_us = int(self._controls["FrameDurationLimits"][0])
+        limits = (fastest_us, max(fastest_us, exposure_us + _BLANK_US))
+        with translate_errors(self._name, "setting exposure and gain"):
+            self._camera.set_controls(
+                {"ExposureTime": exposure_us, "AnalogueGain": gain, "FrameDurationLimits": limits}
+            )
+        return fastest_us
+
+    def _request(self, ahead: int) -> None:
+        """Have the next frames kept, so many of them."""
+        while len(self._jobs) < ahead:
+            self._jobs.append(self._camera.capture_request(wait=False))
+
     def _next(self, timeout_s: float) -> Any:
         """Return the next complete request, to be released by the caller; None after `timeout_s`."""
-        if self._job is None:
-            self._job = self._camera.capture_request(wait=False)
+        self._request(_WIRED_AHEAD if self._wired else 1)
         try:
-            request = self._camera.wait(self._job, timeout=timeout_s)
+            request = self._camera.wait(self._jobs[0], timeout=timeout_s)
         except (JobTimeoutError, TimeoutError):
             return None
-        self._job = None
+        self._jobs.popleft()
         return request
 
     def _stop(self) -> None:
-        if self._job is not None:
+        if self._jobs:
+            with suppress(JobTimeoutError, TimeoutError):
+                while self._wired and self._jobs:
+                    # What came and was not read; the first that did not come ends this.
+                    self._camera.wait(self._jobs[0], timeout=0).release()
+                    self._jobs.popleft()
             # Stopping waits for earlier jobs, and so would not end if no frame comes.
             self._camera.cancel_all_and_flush()
-            self._job = None
+            self._jobs.clear()
         with translate_errors(self._name, "stopping it"):
             self._camera.stop()
 
@@ -402,7 +470,10 @@ class PiCamera:
         now_ns = self._clock.now_ns()
         exposure_ns = round(metadata["ExposureTime"] * 1e3)
         stamp_ns = _monotonic(metadata["SensorTimestamp"], now_ns)
-        if self._last_ns:
+        if self._wired:
+            exposure_ns = self._exposure_by_wire_ns(metadata)
+            self._number += 1
+        elif self._last_ns:
             steps = max(round((stamp_ns - self._last_ns) / (metadata["FrameDuration"] * 1e3)), 1)
             self._number += steps
             self._dropped += steps - 1
@@ -411,7 +482,9 @@ class PiCamera:
         if start_ns - _ERROR_NS < after_ns:
             return None
         # All rows are read out within a frame of the fastest mode, and before the frame arrived.
-        skew_ns = 0 if self._options.global_shutter else round(self._controls["FrameDurationLimits"][0] * 1e3)
+        skew_ns = (
+            0 if self._options.global_shutter or self._wired else round(self._controls["FrameDurationLimits"][0] * 1e3)
+        )
         skew_ns = max(min(skew_ns, now_ns - start_ns - exposure_ns), 0)
         data = request.make_buffer(self._stream.name)
         return Frame(
@@ -428,22 +501,41 @@ class PiCamera:
             colour=self._stream.colour(data),
         )
 
+    def _exposure_by_wire_ns(self, metadata: Mapping[str, Any]) -> int:
+        """Return what the pulse is expected to last. Raises UnsupportedByDeviceError if the gain is another one."""
+        if self._applied is None:
+            message = f"camera '{self._name}' exposes as its pulses last, which was not said; configure it first"
+            raise DeviceStateError(message)
+        if not _is_close(metadata["AnalogueGain"], self._applied.gain):
+            message = (
+                f"camera '{self._name}': requested gain {self._applied.gain:g}, it gives "
+                f"{metadata['AnalogueGain']:g}; use this value"
+            )
+            raise UnsupportedByDeviceError(message)
+        return round(self._applied.exposure_s * 1e9)
+
     def _describe(self, known: Mapping[str, Any]) -> CameraInfo:
         min_gain, max_gain = self._controls["AnalogueGain"][:2]
-        max_us = self._controls["ExposureTime"][1]
-        # libcamera may report 0 for "automatic": the metadata of a frame have the sensor's minimum.
-        shortest = self._run_until_applied(
-            max(self._controls["ExposureTime"][0], 1) / 1e6, max(float(min_gain), 1.0), 1
-        )
+        # libcamera reports a maximum of 0 for some sensors (IMX296).
+        longest_s = min((self._controls["ExposureTime"][1] or math.inf) / 1e6, MAX_EXPOSURE_S)
+        if self._wired:
+            shortest_s = _SHORTEST_PULSE_S
+        else:
+            # It may report 0 for "automatic": the metadata of a frame have the sensor's minimum.
+            shortest = self._run_until_applied(
+                max(self._controls["ExposureTime"][0], 1) / 1e6, max(float(min_gain), 1.0), 1
+            )
+            shortest_s = shortest["ExposureTime"] / 1e6
         return CameraInfo(
             name=self._name,
             model=str(known["Model"]),
             serial=self._options.device,
             format=CameraFormat(self._stream.size, self._stream.layout.bit_depth),
-            triggers=frozenset({Trigger.FREE}),
-            exposure_range_s=(shortest["ExposureTime"] / 1e6, min(max_us / 1e6, MAX_EXPOSURE_S)),
+            triggers=frozenset({Trigger.HARDWARE if self._wired else Trigger.FREE}),
+            exposure_range_s=(shortest_s, longest_s),
             gain_range=(max(float(min_gain), 1.0), float(max_gain)),
             colour=self._stream.layout.has_colour,
+            exposed_by_pulse=self._wired,
         )
 
     def _fixed_controls(self) -> dict[str, object]:

@@ -215,7 +215,7 @@ class BoxLimits:
 @dataclass(frozen=True, slots=True)
 class BoxInfo:
     """Properties of a box from HELLO, named as in the protocol. pick : 0 for a box that supports only runs of its
-    flash.
+    flash. pulse : empty for a box whose pulses have a length of its own.
     """
 
     sltp: int
@@ -235,6 +235,7 @@ class BoxInfo:
     hold_us: int
     least_us: int
     pick: int = 0
+    pulse: str = ""
 
     @property
     def light_s(self) -> float:

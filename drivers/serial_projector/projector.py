@@ -87,6 +87,7 @@ class SerialProjector:
             latency_s=box.light_s,
             gap_s=box.gap_us / 1e6,
             duty=box.duty / 1000,
+            pulses_expose=box.pulse == "exposure",
         )
         self._boot = box.boot
         self._state = ProjectorState(f"the trigger box on {options.port}")

@@ -218,8 +218,8 @@ def capture_by_wire(session: CaptureSession, retries: RetryPolicy) -> Iterator[S
     Frames are yielded as they come. The frames of a failed play are rejected, and all come again: more slowly if a
     camera missed pulses, because the rate that cameras state is a bound that not all reach by wire. What worked is kept
     in `Rig.paces_s`.
-    Raises UnsupportedByDeviceError: a camera has no exposure set; FrameTimeoutError, ScanEvidenceError: the third play
-    failed.
+    Raises UnsupportedByDeviceError: a camera has no exposure set, or the pulses do not give it; FrameTimeoutError,
+    ScanEvidenceError: the third play failed.
     """
     rig, count = session.rig, len(session.sequence)
     unset = sorted(set(rig.cameras) - set(session.applied))
@@ -231,6 +231,7 @@ def capture_by_wire(session: CaptureSession, retries: RetryPolicy) -> Iterator[S
     rig.projector.load(session.sequence)
     lit_s, asked_s = play_times_s(session)
     period_s = rig.paces_s.get((lit_s, asked_s), asked_s)
+    _require_exposing_pulses(session, lit_s)
     last: dict[str, Frame] = {}
     causes: list[str] = []
     timed_out = 0
@@ -261,6 +262,26 @@ def capture_by_wire(session: CaptureSession, retries: RetryPolicy) -> Iterator[S
             retries.refuse(RefusedFrame(shot.pattern, shot.camera, number, causes[-1], shot))
     message = f"the sequence was played {MAX_PLAYS} times by wire: {describe_causes(causes)}"
     raise FrameTimeoutError(message) if timed_out == len(causes) else ScanEvidenceError(message)
+
+
+def _require_exposing_pulses(session: CaptureSession, lit_s: float) -> None:
+    """Raise UnsupportedByDeviceError if the pulses would expose a camera for another time than it is set to."""
+    projector = session.rig.projector.info
+    for name, camera in session.rig.cameras.items():
+        if not camera.info.exposed_by_pulse:
+            continue
+        set_s = session.applied[name].exposure_s
+        if not projector.pulses_expose:
+            raise UnsupportedByDeviceError(
+                f"camera '{name}' exposes for as long as the pulse on its wire lasts, and those of {projector.model} "
+                "have a length of their own; use a trigger box with the firmware of this version of slrig"
+            )
+        if differs_from_request(lit_s, set_s):
+            raise UnsupportedByDeviceError(
+                f"camera '{name}' exposes for as long as the pulse on its wire lasts, which is {lit_s:.6g} s for this "
+                f"rig's cameras together, and its exposure_s is {set_s:.6g} s; write the same exposure_s into each "
+                "camera's table, and put no rolling shutter on the same wire"
+            )
 
 
 def play_times_s(session: CaptureSession) -> tuple[float, float]:

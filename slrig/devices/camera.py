@@ -73,7 +73,8 @@ class CameraInfo:
     """Declared data of a camera.
 
     triggers : supported triggers. limits : time-outs of its calls. notes : remarks for the user about how the camera is
-    set up, each a sentence with the remedy. colour : True if its frames have `Frame.colour`.
+    set up, each a sentence with the remedy. colour : True if its frames have `Frame.colour`. exposed_by_pulse : True if
+    a wire's pulse is its exposure, so that it cannot tell how long it exposed.
     """
 
     name: str
@@ -86,6 +87,7 @@ class CameraInfo:
     limits: CallLimits = DEFAULT_LIMITS
     notes: tuple[str, ...] = ()
     colour: bool = False
+    exposed_by_pulse: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,8 @@ class ProjectorInfo:
     periods; None if exposures may have any length. limits : time-outs of its calls. recorded : patterns of a recording,
     in its order, which a scan plays by default; empty if the projector shows any pattern. lights : True if it has
     separate red, green and blue lights, and shows `Primary`. shades : False if it shows black and white only, so that
-    it refuses patterns with shades of grey.
+    it refuses patterns with shades of grey. pulses_expose : True if its pulses last as long as the exposure that `play`
+    was given.
     """
 
     name: str
@@ -37,6 +38,7 @@ class ProjectorInfo:
     duty: float = 1.0
     lights: bool = False
     shades: bool = True
+    pulses_expose: bool = False
 
 
 @dataclass(frozen=True, slots=True)

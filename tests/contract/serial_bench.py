@@ -44,7 +44,7 @@ class TriggerBox:
     def _lit(self, pattern: int | None) -> None:
         self.stage.show(None if pattern is None else self.flashed.profiles[pattern])
 
-    def _pulsed(self) -> None:
+    def _pulsed(self, _us: int) -> None:
         for camera in self.cameras.values():
             camera.pulse(time.monotonic_ns())
 

@@ -6,7 +6,7 @@ import sys
 import threading
 import types
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -54,6 +54,10 @@ class Pi:
     asked: dict[str, Any] = field(default_factory=dict)
     exposures: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=10_000))
     held: int = 0
+    pulses: deque[tuple[int, int]] | None = None
+    """Exposures by XTR that are still to come: begin and end. None for a sensor that runs freely."""
+    look: Callable[[], object] = lambda: None
+    """Called before it looks for pulses."""
 
     @contextmanager
     def connected(self) -> Iterator[None]:
@@ -121,7 +125,8 @@ class FakePicamera2:
         self._clock = pi.stage.clock
         self._config: dict[str, Any] = {}
         self._pending: dict[str, Any] = {}
-        self._job: Job | None = None
+        self._jobs: deque[Job] = deque()
+        self._buffers = BUFFERS
         self._kept: FakeRequest | None = None
         self._running = False
         self._rng = np.random.default_rng(5)
@@ -139,6 +144,7 @@ class FakePicamera2:
         return [{"size": mode, "unpacked": self.pi.raw_format, "bit_depth": 10, "fps": 120.0} for mode in modes]
 
     def create_video_configuration(self, **table: Any) -> dict[str, Any]:
+        self._buffers = table.get("buffer_count", BUFFERS)
         config: dict[str, Any] = {
             "main": {"format": "XBGR8888", "size": (1280, 720)},
             "raw": {"format": self.pi.raw_format},
@@ -183,7 +189,7 @@ class FakePicamera2:
         self._running = True
 
     def stop(self) -> None:
-        assert self._job is None, "stop waits for the jobs before it"
+        assert not self._jobs, "stop waits for the jobs before it"
         self._running = False
         self._keep(None)
 
@@ -193,34 +199,47 @@ class FakePicamera2:
 
     def capture_request(self, wait: bool | None = None) -> Job:
         assert wait is False
-        self._job = job = Job()
+        job = Job()
+        self._jobs.append(job)
         self._run()
         return job
 
     def wait(self, job: Job, timeout: float) -> FakeRequest:
         until_ns = self._clock.now_ns() + round(timeout * 1e9)
         while job.request is None and self._clock.now_ns() < until_ns:
-            end_ns = until_ns if self.pi.frozen else self._next_ns + self._exposure_us * 1000
-            self._clock.wait_until(min(end_ns, until_ns), _NEVER)
+            # Nobody knows when pulses come.
+            end_ns = self._clock.now_ns() + 1_000_000 if self.pi.pulses is not None else self._next()[1]
+            self._clock.wait_until(until_ns if self.pi.frozen else min(end_ns, until_ns), _NEVER)
             self._run()
         if job.request is None:
             raise TimeoutError
         return job.request
 
     def cancel_all_and_flush(self) -> None:
-        self._job = None
+        self._jobs.clear()
 
     def _keep(self, request: FakeRequest | None) -> None:
         if self._kept is not None:
             self._kept.release()
         self._kept = request
 
+    def _next(self) -> tuple[int, int]:
+        """When the next exposure begins and ends."""
+        if self.pi.pulses is None:
+            return self._next_ns, self._next_ns + self._exposure_us * 1000
+        self.pi.look()
+        return self.pi.pulses[0] if self.pi.pulses else (0, sys.maxsize)
+
     def _run(self) -> None:
-        """Make the frames that have ended by now, and hand the last one to who asks."""
-        while not self.pi.frozen and (end_ns := self._next_ns + self._exposure_us * 1000) <= self._clock.now_ns():
-            start_ns, self._next_ns = self._next_ns, self._next_ns + self._duration_us * 1000
+        """Make the frames that have ended by now, each for the job that has waited longest; else the last is kept."""
+        while not self.pi.frozen and self._next()[1] <= self._clock.now_ns():
+            start_ns, end_ns = self._next()
+            if self.pi.pulses is None:
+                self._next_ns += self._duration_us * 1000
+            else:
+                self.pi.pulses.popleft()
             self.pi.exposures.append((start_ns, end_ns))
-            if self._rng.random() < self.pi.lost + self.pi.damaged or self.pi.held >= BUFFERS:
+            if self._rng.random() < self.pi.lost + self.pi.damaged or self.pi.held >= self._buffers:
                 continue
             metadata = {
                 "SensorTimestamp": (start_ns if self.pi.stamps_start else end_ns) + self.pi.stamp_offset_ns,
@@ -230,8 +249,12 @@ class FakePicamera2:
             }
             self.pi.held += 1
             self._keep(FakeRequest(self, self._seen(start_ns, end_ns, self._gain), metadata))
-        if self._job is not None and self._kept is not None:
-            self._job.request, self._job, self._kept = self._kept, None, None
+            self._serve()
+        self._serve()
+
+    def _serve(self) -> None:
+        if self._jobs and self._kept is not None:
+            self._jobs.popleft().request, self._kept = self._kept, None
 
     def _seen(self, start_ns: int, end_ns: int, gain: float) -> NDArray[np.uint8]:
         stream = self._config[self.read_stream]

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 
 from drivers.picamera2 import PiCamera, find_devices, open_camera
-from slrig.devices import CameraSettings, Trigger
+from drivers.picamera2 import camera as camera_module
+from slrig.capture import capture
+from slrig.devices import CameraSettings, Rig, Trigger
 from slrig.errors import (
     DeviceBusyError,
     DeviceGoneError,
@@ -21,7 +27,8 @@ from slrig.errors import (
 from slrig.model import Frame, Size
 from tests.contract.stage import Stage
 from tests.unit.capture.fake_rig import Scene
-from tests.unit.drivers.picamera2.fake_picamera2 import BLANK_US, Pi
+from tests.unit.drivers.picamera2.fake_picamera2 import BLANK_US, CONTROLS, Pi
+from tests.unit.drivers.serial_projector.conftest import SEQUENCE, Bench
 from tests.virtual_clock import VirtualClock
 
 WHITE = np.full((1, 1), 255, np.uint8)
@@ -149,3 +156,100 @@ def test_a_camera_that_falls_silent_times_out_and_can_be_closed() -> None:
         where.frozen = True
         with pytest.raises(FrameTimeoutError, match="check its cable"):
             camera.read(where.stage.clock.now_ns(), 0.2)
+
+
+@pytest.fixture
+def trigger_mode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The kernel's switch, set to pulses."""
+    file = tmp_path / "trigger_mode"
+    file.write_text("1\n")
+    monkeypatch.setattr(camera_module, "TRIGGER_MODE", file)
+    return file
+
+
+def wired(clock: VirtualClock | None = None, **scene: Any) -> Pi:
+    """A Raspberry Pi with a global-shutter camera, whose limits are those that libcamera 0.2 reports."""
+    stage = Stage(Scene(camera=SIZE, bit_depth=10, **scene), clock=clock or VirtualClock())
+    limits = {"ExposureTime": (29, 0, 0), "FrameDurationLimits": (16_562, 15_534_385, 33_333)}
+    return Pi(stage, model="imx296", controls={**CONTROLS, **limits}, pulses=deque())
+
+
+@pytest.mark.usefixtures("trigger_mode")
+def test_a_pulse_on_the_wire_is_an_exposure_and_every_frame_is_kept() -> None:
+    clock = VirtualClock()
+    where = wired(clock)
+    assert where.pulses is not None
+    where.stage.show(WHITE)
+    with opened(where, external_trigger=True) as camera:
+        assert camera.info.triggers == {Trigger.HARDWARE}
+        assert camera.info.exposed_by_pulse
+        assert camera.info.exposure_range_s == (50e-6, 1.0)
+        applied = camera.configure(CameraSettings(EXPOSURE_S, 2.0))
+        assert applied.min_period_s == pytest.approx(EXPOSURE_S + 0.016562)
+        for count in (8, 3):
+            camera.arm(count + 1, Trigger.HARDWARE)
+            with pytest.raises(FrameTimeoutError, match="the wire to XTR"):
+                camera.read(0, 0.1)
+            begin_ns = clock.now_ns()
+            where.pulses.extend((begin_ns + 25_000_000 * at, begin_ns + 25_000_000 * at + 5_000_000) for at in range(8))
+            # Nobody reads meanwhile.
+            clock.advance(0.5)
+            for at in range(count):
+                frame = camera.read(0, 1.0)
+                assert abs(frame.t_start_ns - begin_ns - 25_000_000 * at) <= frame.t_err_ns
+                assert (frame.sequence_number, frame.dropped_count) == (at + 1, 0)
+                assert (frame.exposure_s, frame.gain, frame.shutter_skew_s) == (EXPOSURE_S, 2.0, 0.0)
+                np.testing.assert_array_equal(frame.image, where.stage.expected(WHITE, exposure_s=2 * EXPOSURE_S))
+            camera.disarm()
+
+
+@pytest.mark.parametrize(
+    ("model", "mode", "external", "words"),
+    [
+        ("imx296", "0", True, "runs freely; echo 1 | sudo tee"),
+        ("imx296", "1", False, "waits for pulses on XTR; echo 0 | sudo tee"),
+        ("ov9281", "1", True, "which sensor imx296 has, and this is ov9281"),
+    ],
+)
+def test_a_sensor_that_is_switched_otherwise_is_refused(
+    trigger_mode: Path, model: str, mode: str, external: bool, words: str
+) -> None:
+    trigger_mode.write_text(f"{mode}\n")
+    with pytest.raises(UnsupportedByDeviceError, match=words):
+        pi(model=model).opened(external_trigger=external)
+
+
+@pytest.mark.usefixtures("trigger_mode")
+def test_a_trigger_box_and_a_global_shutter_camera_scan_by_wire(make_bench: Callable[..., Bench]) -> None:
+    box = make_bench()
+    where = wired(box.clock, projector=SEQUENCE.projector, columns_per_px=SEQUENCE.projector.width_px / SIZE.width_px)
+    pulses = where.pulses
+    assert pulses is not None
+    where.look = box.line.catch_up
+
+    def light(pattern: int | None) -> None:
+        where.stage.show(None if pattern is None else SEQUENCE.profiles[pattern], asked_ns=box.scene.now_ns())
+
+    box.scene.watch.append(light)
+    box.scene.on_pulse.append(lambda us: pulses.append((box.scene.now_ns(), box.scene.now_ns() + us * 1000)))
+    projector = box.open()
+    assert projector.info.pulses_expose
+    with opened(where, external_trigger=True) as camera:
+        for exposure_s in (0.0025, 0.01):
+            settings = {"left": CameraSettings(exposure_s)}
+            rig = Rig("bench", {"left": camera}, projector, settings, clock=box.clock)
+            shots = list(capture(rig, SEQUENCE))
+            assert [shot.pattern for shot in shots] == list(range(len(SEQUENCE)))
+            begun, ended = where.exposures[-1]
+            assert ended - begun == round(exposure_s * 1e9)
+        # Another camera on the wire would make the pulses longer.
+        with opened(wired(box.clock), external_trigger=True) as other:
+            cameras = {"left": camera, "right": other}
+            rig = Rig("bench", cameras, projector, {**settings, "right": CameraSettings(0.02)}, clock=box.clock)
+            with pytest.raises(UnsupportedByDeviceError, match=r"which is 0\.02 s .* and its exposure_s is 0\.01 s"):
+                list(capture(rig, SEQUENCE))
+        own_pulses = replace(projector.info, pulses_expose=False)
+        with mock.patch.object(type(projector), "info", own_pulses):
+            rig = Rig("bench", {"left": camera}, projector, settings, clock=box.clock)
+            with pytest.raises(UnsupportedByDeviceError, match="have a length of their own; use a trigger box"):
+                list(capture(rig, SEQUENCE))

@@ -32,7 +32,7 @@ class Scene:
     changes: list[Change] = field(default_factory=list)
     pulses_ns: list[int] = field(default_factory=list)
     watch: list[Callable[[int | None], None]] = field(default_factory=list)
-    on_pulse: list[Callable[[], None]] = field(default_factory=list)
+    on_pulse: list[Callable[[int], None]] = field(default_factory=list)
     at_ns: int | None = None
 
     def now_ns(self) -> int:
@@ -45,10 +45,10 @@ class Scene:
         for tell in self.watch:
             tell(pattern)
 
-    def pulse(self) -> None:
+    def pulse(self, us: int) -> None:
         self.pulses_ns.append(self.now_ns())
         for tell in self.on_pulse:
-            tell()
+            tell(us)
 
     @property
     def lit(self) -> int | None:
@@ -87,9 +87,9 @@ class FakeLight(BoxHardware):
         self._maybe("dark")
         self._scene.change(None, self._boot)
 
-    def pulse(self, us: int) -> None:  # noqa: ARG002 - its scene has no cameras that it could expose
+    def pulse(self, us: int) -> None:
         self._maybe("pulse")
-        self._scene.pulse()
+        self._scene.pulse(us)
 
     def set_brightness(self, permille: int) -> int:
         self.bright = permille if self.dims else 1000
