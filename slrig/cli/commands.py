@@ -553,6 +553,25 @@ def doctor(
 
 @app.command()
 @grouped
+def report(
+    *,
+    output: Annotated[Path, typer.Argument(metavar="BENCH.zip", help="The file to write.")],
+    rig: RigOption = None,
+    service: ServiceOptions,
+    pictures: Annotated[bool, typer.Option("--pictures", help="Add previews and frames of the two scans.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite the file.")] = False,
+) -> None:
+    """Gather in one file what helps others to help you.
+
+    Versions, devices, controls, doctor, conform, latency, two scans, the kernel's log: text, without pictures and keys.
+    """
+    from slrig.cli.report import write_report
+
+    write_report(rig, service, output, pictures=pictures, force=force)
+
+
+@app.command()
+@grouped
 def verify(
     source: Annotated[
         Path,

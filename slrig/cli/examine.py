@@ -39,6 +39,7 @@ from slrig.errors import ConfigError, StorageError
 from slrig.jobs.job import Job
 from slrig.jobs.records import JobKind
 from slrig.logs import set_up_console_logs
+from slrig.scan.plan import ProgressCallback
 
 _COLOURS = {
     Severity.OK: "green",
@@ -133,19 +134,26 @@ def _examined(
     """
     with progress_shown() as display:
         if rig_file is None:
-            job = client.post(f"/rig/{kind}", options)
-            try:
-                job = client.examinations.wait(job["id"], display)
-            except KeyboardInterrupt:
-                client.examinations.cancel(job["id"])
-                raise
-            return job["summary"], None if job["error"] is None else job["error"]["detail"]
+            return examined_by(client, kind, options, display)
         config = read_rig(rig_file)
         display("opening the rig", 0.0, "")
         record = run_job(config, _job(kind, config, options), display)
     found = dict(record.summary or {})
     _keep(data, kind, found)
     return found, None if record.fault is None else record.fault.message
+
+
+def examined_by(
+    client: Client, kind: JobKind, options: Mapping[str, Any], display: ProgressCallback
+) -> tuple[dict[str, Any], str | None]:
+    """See `_examined`: by the service of a client. Raises ServiceError, ExaminationFailedError."""
+    job = client.post(f"/rig/{kind}", options)
+    try:
+        job = client.examinations.wait(job["id"], display)
+    except KeyboardInterrupt:
+        client.examinations.cancel(job["id"])
+        raise
+    return job["summary"], None if job["error"] is None else job["error"]["detail"]
 
 
 def _job(kind: JobKind, config: RigConfig, options: Mapping[str, Any]) -> Job:

@@ -578,22 +578,26 @@ def list_devices(*, as_json: bool) -> None:
     with _only_ours_on_stdout():
         drivers = installed_drivers()
         found = discover_devices()
-    broken = broken_packages(drivers)
     if as_json:
-        document = {
-            "drivers": [asdict(driver) for driver in drivers],
-            "devices": [asdict(device) for device in found.devices],
-            "missing": [asdict(library) for library in found.missing],
-            "broken": [asdict(package) for package in broken],
-            "elsewhere": [asdict(driver) for driver in found.elsewhere],
-            "faults": [str(fault) for fault in found.faults],
-        }
-        print_json(document)
+        print_json(devices_document(drivers, found))
         return
+    broken = broken_packages(drivers)
     console = Console()
     _tell_drivers(drivers, found, console)
     _tell_devices(found, console)
     _tell_remedies(found, broken, {driver.fault for driver in drivers})
+
+
+def devices_document(drivers: Sequence[InstalledDriver], found: DiscoveredDevices) -> dict[str, Any]:
+    """What `slrig devices --json` prints."""
+    return {
+        "drivers": [asdict(driver) for driver in drivers],
+        "devices": [asdict(device) for device in found.devices],
+        "missing": [asdict(library) for library in found.missing],
+        "broken": [asdict(package) for package in broken_packages(drivers)],
+        "elsewhere": [asdict(driver) for driver in found.elsewhere],
+        "faults": [str(fault) for fault in found.faults],
+    }
 
 
 def broken_packages(drivers: Sequence[InstalledDriver]) -> tuple[BrokenPackage, ...]:

@@ -56,7 +56,7 @@ def write_rig_file(diagnosis: Diagnosis, source: Path, target: Path, *, force: b
 def refuse_existing(target: Path, *, force: bool) -> None:
     """Raise ConfigError if a file would be overwritten without `force`."""
     if target.exists() and not force:
-        message = f"{target} exists and is unchanged; choose another name with --output, or overwrite it with --force"
+        message = f"{target} exists and is unchanged; choose another name, or overwrite it with --force"
         raise ConfigError(message)
 
 
