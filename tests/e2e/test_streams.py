@@ -44,7 +44,10 @@ def test_streams_of_a_command_end_with_it(tmp_path: Path, name: str) -> None:
     if COMMANDS[name][0] == "serve":
         said.append(command.stdout.readline())
         command.send_signal(signal.SIGTERM if name == "terminated" else signal.SIGKILL)
-    readers = [threading.Thread(target=lambda s=s: said.append(s.read())) for s in (command.stdout, command.stderr)]
+    readers = [
+        threading.Thread(target=lambda s=s: said.append(s.read()), daemon=True)
+        for s in (command.stdout, command.stderr)
+    ]
     for reader in readers:
         reader.start()
     code = command.wait(300)
