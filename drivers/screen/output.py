@@ -34,6 +34,7 @@ from drivers.screen.randr import (
     watch_outputs,
 )
 from drivers.screen.sdl import Canvas, SdlOutput, open_fullscreen, start_sdl
+from drivers.screen.session import exact_session, exempting, session_name
 from drivers.screen.x11 import (
     COMPLETE_NOTIFY,
     OUTPUT_CHANGES,
@@ -255,13 +256,12 @@ class ReservedOutput:
             if time.monotonic() > until_s:
                 manager = selection_owner(self.connection, atom(self.connection, "_NET_WM_CM_S0"))
                 data = window_property(self.connection, manager, "_NET_WM_NAME") if manager else b""
+                name = data.decode("utf-8", "replace")
                 message = (
                     f"output {self.output.name} is drawn by a compositor "
-                    f"({data.decode('utf-8', 'replace') or 'without a name'}), which may delay, scale or tint pictures "
-                    "and does not exempt a window that asks for it (_NET_WM_BYPASS_COMPOSITOR); switch compositing off "
-                    "(Xfce: xfconf-query -c xfwm4 -p /general/use_compositing -s false; KDE: Shift+Alt+F12; picom: "
-                    "unredir-if-possible = true), or set trust_compositor = true if you have checked that patterns "
-                    "come out right"
+                    f"({name or 'without a name'}), which may delay, scale or tint pictures and does not exempt a "
+                    f"window that asks for it (_NET_WM_BYPASS_COMPOSITOR); {exempting(name)}; or set trust_compositor "
+                    "= true if you have checked that patterns come out right"
                 )
                 raise UnsupportedByDeviceError(message)
             time.sleep(_POLL_INTERVAL_S)
@@ -457,9 +457,9 @@ def _open_surface(reserved: ReservedOutput, options: ScreenOptions) -> PresentSu
 
 
 def _open_without_x(options: ScreenOptions) -> SdlOutput:
-    system = {"win32": "Windows", "darwin": "macOS"}.get(sys.platform, "a session without X (Wayland, a console)")
+    system = session_name()
     if options.backend == "x11":
-        message = f"backend x11 needs an X server, found {system}; log in to an X session, or set DISPLAY"
+        message = f"backend x11 needs an X server, found {system}; {exact_session()}"
         raise UnsupportedByDeviceError(message)
     _require_trust(options, system)
     return open_fullscreen(options)
@@ -469,8 +469,7 @@ def _require_trust(options: ScreenOptions, system: str) -> None:
     if not options.trust_compositor:
         message = (
             f"output {options.output}: found {system}, where no program can find out whether its pixels are scaled, "
-            "tinted or delayed, or which output they go to; log in to an X session (Xorg), or start an X server for "
-            "the projector alone. If you have checked that patterns come out right there (scaling 100 %, night light "
-            "off, not mirrored), set trust_compositor = true"
+            f"tinted or delayed, or which output they go to; {exact_session()}; or, if you have checked that patterns "
+            "come out right here (scaling 100 %, night light off, not mirrored), set trust_compositor = true"
         )
         raise UnsupportedByDeviceError(message)

@@ -27,6 +27,7 @@ from drivers.screen.randr import (
     require_exact,
     require_true_colour,
 )
+from drivers.screen.session import exempting
 from drivers.screen.x11 import DisplayWakeLock, XScreen
 from slrig.errors import ConfigError, DeviceGoneError, LibraryMissingError, UnsupportedByDeviceError
 from slrig.model import Size
@@ -237,10 +238,56 @@ def table(output: str, **options: object) -> dict[str, object]:
 @pytest.mark.usefixtures("wayland")
 def test_a_compositor_that_reports_nothing_is_refused_unless_trusted() -> None:
     (found,) = find_devices()
-    with pytest.raises(UnsupportedByDeviceError, match=r"session without X .* trust_compositor = true"):
+    with pytest.raises(UnsupportedByDeviceError, match=r"session without X: Wayland.* trust_compositor = true"):
         open_projector(table(found.device, trust_compositor=False), Path())
     with pytest.raises(UnsupportedByDeviceError, match="backend x11 needs an X server"):
         open_projector(table(found.device, backend="x11"), Path())
+
+
+@pytest.mark.parametrize(
+    ("desktop", "words"),
+    [
+        ("ubuntu:GNOME", "'GNOME on Xorg'"),
+        ("X-Cinnamon", "choose 'Cinnamon', not 'Cinnamon on Wayland'"),
+        ("KDE", "choose 'Plasma (X11)'"),
+        ("labwc:wlroots", "raspi-config"),
+        ("sway", "log in to a session with X (Xorg)"),
+        (None, "set DISPLAY=:0 and XAUTHORITY"),
+    ],
+)
+def test_a_session_without_x_says_how_to_get_one_and_how_to_do_without(
+    monkeypatch: pytest.MonkeyPatch, desktop: str | None, words: str
+) -> None:
+    for name, value in {"DISPLAY": None, "WAYLAND_DISPLAY": desktop, "XDG_CURRENT_DESKTOP": desktop}.items():
+        monkeypatch.delenv(name, raising=False) if value is None else monkeypatch.setenv(name, value)
+    with pytest.raises(UnsupportedByDeviceError) as refusal:
+        open_projector(table("HDMI-1", trust_compositor=False), Path())
+    said = str(refusal.value)
+    assert words in said
+    if desktop is not None:
+        assert f"Wayland ({desktop})" in said
+    for command in ("systemctl isolate multi-user.target", "slrig devices", "systemctl isolate graphical.target"):
+        assert command in said
+
+
+@pytest.mark.parametrize(
+    ("name", "desktop", "words"),
+    [
+        ("Mutter (Muffin)", "X-Cinnamon", "org.cinnamon.muffin unredirect-fullscreen-windows"),
+        ("", "ubuntu:GNOME", "no setting of GNOME"),
+        ("KWin", "KDE", "Shift+Alt+F12"),
+        ("", "XFCE", "use_compositing"),
+        ("fancy effects", "", "in the settings of the desktop"),
+    ],
+)
+def test_a_compositor_is_told_to_leave_the_patterns_alone(
+    monkeypatch: pytest.MonkeyPatch, name: str, desktop: str, words: str
+) -> None:
+    monkeypatch.setenv("XDG_CURRENT_DESKTOP", desktop)
+    said = exempting(name)
+    assert words in said
+    assert said.count(";") == 1
+    assert "'kms'" in said
 
 
 def test_a_display_is_filled_with_exact_pixels(wayland: Any, monkeypatch: pytest.MonkeyPatch) -> None:
