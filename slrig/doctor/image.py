@@ -226,19 +226,26 @@ def measure_response(session: CameraSession, light: LightMeasurement) -> tuple[R
     except DeviceError as error:
         message = f"it shows no greys, so nothing can bend its black and white: {error}"
         return None, [ok("response.binary", "projector", message)]
-    shares = _measure_greys(session, light, sequence)
+    exponent = _camera_exponent(session, light, sequence)
+    camera = [] if exponent is None else [_check_camera_linearity(session.name, exponent)]
+    # What the camera makes of light is not the projector's fault: bent darks look like a limited range.
+    is_bent = exponent is not None and abs(exponent - 1) > _EXPONENT_TOLERANCE
+    shares = _measure_greys(session, light, sequence, exponent if exponent is not None and is_bent else 1.0)
     if shares[1] > _ALL_WHITE:
-        return None, [ok("response.binary", "projector", "it shows every grey as white: nothing bends black and white")]
+        message = "it shows every grey as white: nothing bends black and white"
+        return None, [ok("response.binary", "projector", message), *camera]
     curve = fit_response_curve([float(value) for value in values], [float(share) for share in shares])
-    return curve, [*_check_projector_response(curve), *_check_camera_linearity(session, light, sequence)]
+    return curve, [*_check_projector_response(curve), *camera]
 
 
-def _measure_greys(session: CameraSession, light: LightMeasurement, sequence: PatternSequence) -> FloatArray:
-    """(33,) float64: light of each grey, 0 for black and 1 for white of this sequence."""
+def _measure_greys(
+    session: CameraSession, light: LightMeasurement, sequence: PatternSequence, exponent: float
+) -> FloatArray:
+    """(33,) float64: light of each grey, 0 for black and 1 for white of this sequence. exponent : of the camera."""
     with session.arm(sequence, light.exposure_s, _GREY_FRAMES * len(sequence)):
         shares = [
-            float(np.mean([light.levels.relative_level(f.image) for f in session.capture_frames(index, _GREY_FRAMES)]))
-            for index in range(len(sequence))
+            float(np.mean([light.levels.relative_level(frame.image, exponent) for frame in frames]))
+            for frames in (session.capture_frames(index, _GREY_FRAMES) for index in range(len(sequence)))
         ]
     levels = np.array(shares)
     return np.asarray((levels - levels[0]) / (levels[-1] - levels[0]), np.float64)
@@ -283,10 +290,8 @@ def _check_projector_response(curve: ResponseCurve) -> list[Finding]:
     return findings or [ok("response.straight", "projector", proportional)]
 
 
-def _check_camera_linearity(
-    session: CameraSession, light: LightMeasurement, sequence: PatternSequence
-) -> list[Finding]:
-    """Check that values grow in proportion to the exposure: a test of the camera alone."""
+def _camera_exponent(session: CameraSession, light: LightMeasurement, sequence: PatternSequence) -> float | None:
+    """The power by which a camera's values grow with the exposure, a test of the camera alone; None if unknown."""
     exposures_s: list[float] = []
     contrast_dn: list[float] = []
     usable = light.levels.usable
@@ -299,12 +304,15 @@ def _check_camera_linearity(
         exposures_s.append(session.exposure_s)
         contrast_dn.append(float(bright - dark))
     if min(contrast_dn) <= 0 or exposures_s[-1] > 0.75 * exposures_s[0]:
-        return []
-    exponent = fit_camera_exponent(exposures_s, contrast_dn)
-    subject = camera_label(session.name)
+        return None
+    return fit_camera_exponent(exposures_s, contrast_dn)
+
+
+def _check_camera_linearity(name: str, exponent: float) -> Finding:
+    subject = camera_label(name)
     if abs(exponent - 1) <= _EXPONENT_TOLERANCE:
         message = f"its values grow in proportion to the exposure (power {exponent:.2f})"
-        return [ok("response.camera", subject, message)]
+        return ok("response.camera", subject, message)
     message = (
         f"its values grow with the exposure to the power of {exponent:.2f}, not in proportion: that moves stripes "
         "little, since white and black frames are bent alike, but scans state errors as for a linear camera"
@@ -315,4 +323,4 @@ def _check_camera_linearity(
         "in every mode except raw formats (GREY, Y10, Bayer). If the camera is linear, the projector's light "
         "flickers: see that finding"
     )
-    return [note("response.camera", subject, message, remedy)]
+    return note("response.camera", subject, message, remedy)

@@ -209,10 +209,12 @@ class LightLevels:
         left, right = np.percentile(columns, (1, 99))
         return round(top), round(bottom), round(left), round(right)
 
-    def relative_level(self, image: Pixels) -> float:
-        """Return the position of an image between black, 0, and white, 1, over the usable pixels."""
-        light = (image - self.black)[self.usable].sum()
-        return float(light / self.contrast[self.usable].sum())
+    def relative_level(self, image: Pixels, exponent: float = 1.0) -> float:
+        """Return the position of an image between black, 0, and white, 1, over the usable pixels. exponent : of the
+        camera, whose values grow with the light to that power.
+        """
+        level, black, white = (each[self.usable] ** (1 / exponent) for each in (image, self.black, self.white))
+        return float((level - black).sum() / (white - black).sum())
 
     def longest_exposure_s(self, exposure_s: float) -> float:
         """Return the exposure at which the brightest lit pixels reach MAX_WHITE_SHARE of full scale, from this
@@ -263,8 +265,8 @@ class ResponseCurve:
 
     values : (n,) float64, 0 to 255, rising. light : (n,) float64, never falling, 0 for black and 1 for white. Values
     below black_knee are all black, those above white_knee all white. residual : rms of the measured light from the law.
-    reversal : the largest fall of measured light from one value to a higher one. The curve is that of projector and
-    camera together.
+    reversal : the largest fall of measured light from one value to a higher one. A camera's curve is undone as far as
+    it is a power of the exposure.
     """
 
     values: FloatArray

@@ -19,7 +19,7 @@ from simulated_rig.device import SimulatedHead, open_head
 from slrig.devices import AppliedSettings, Camera, CameraSettings, Projector, Rig, Trigger
 from slrig.doctor import timing
 from slrig.doctor.doctor import Diagnosis, doctor_sequence, examine
-from slrig.doctor.image import check_sharpening
+from slrig.doctor.image import check_sharpening, measure_response
 from slrig.doctor.light import CameraSession, Finding, Severity, locate_picture, measure_light
 from slrig.doctor.measures import depth_mm_per_px
 from slrig.errors import FrameTimeoutError, ScanEvidenceError, UnsupportedByDeviceError
@@ -110,11 +110,18 @@ def with_camera(rig: Rig, **other: Any) -> Rig:
 
 @contextmanager
 def small_rig(
-    folder: Path, scene: str = FACING_PLATE, *, eye: Any = EYE, lamp: Any = LAMP, exposure_s: float = 0.014, **more: Any
+    folder: Path,
+    scene: str = FACING_PLATE,
+    *,
+    eye: Any = EYE,
+    lamp: Any = LAMP,
+    exposure_s: float = 0.014,
+    ambient: float = 0.02,
+    **more: Any,
 ) -> Iterator[Rig]:
     """An open rendered rig; its projector is dark in the end."""
     (folder / "scene.toml").write_text(scene)
-    head = open_head(head_options(camera=eye, projector=lamp, ambient=0.02, **more), folder)
+    head = open_head(head_options(camera=eye, projector=lamp, ambient=ambient, **more), folder)
     assert isinstance(head, SimulatedHead)
     settings = {"eye": CameraSettings(exposure_s)}
     with Rig("small", dict(head.cameras), head.projector, settings, head.calibration, head, clock=head.clock) as opened:
@@ -274,6 +281,44 @@ def test_frames_that_contradict_are_shot_once_more(rig: Rig, late: Container[int
         # What was measured is of the frames that were shot last.
         for axis, found_px in picture.position_px.items():
             assert np.array_equal(found_px[picture.known], other.position_px[axis][picture.known])
+
+
+class LimitedProjector:
+    """A rendered projector that takes full-range values for video levels, 16 to 235."""
+
+    def __init__(self, projector: Projector) -> None:
+        self._projector = projector
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._projector, name)
+
+    def load(self, sequence: PatternSequence) -> None:
+        spread = (grey((profile - 16.0) * 255 / 219) for profile in sequence.profiles)
+        self._projector.load(PatternSequence(sequence.projector, sequence.patterns, tuple(spread)))
+
+
+@pytest.mark.parametrize(
+    ("response", "gamma", "limited", "names"),
+    [
+        (0.6, 2.2, False, {"response.gamma", "response.camera"}),
+        (0.6, 1.0, False, {"response.straight", "response.camera"}),
+        (0.6, 2.2, True, {"response.crushed", "response.clipped", "response.gamma", "response.camera"}),
+        (1.0, 1.0, True, {"response.crushed", "response.clipped", "response.camera"}),
+    ],
+)
+def test_what_the_camera_makes_of_light_is_not_blamed_on_the_projector(
+    tmp_path: Path, response: float, gamma: float, limited: bool, names: set[str]
+) -> None:
+    with small_rig(tmp_path, eye=EYE | {"response": response}, lamp=LAMP | {"gamma": gamma}, ambient=0.1) as rig:
+        used = replace(rig, projector=cast("Projector", LimitedProjector(rig.projector))) if limited else rig
+        session = CameraSession(used, "eye", wait_s=0.05)
+        light, _ = measure_light(session, doctor_sequence(rig.projector.info.size), displays="")
+        assert light is not None
+        curve, findings = measure_response(session, light)
+    assert curve is not None
+    assert {each.name for each in findings} == names
+    assert curve.gamma == pytest.approx(gamma, abs=0.06)
+    assert (curve.black_knee, curve.white_knee) == pytest.approx((16, 235) if limited else (0, 255), abs=3)
 
 
 def grey(values: FloatArray) -> Pixels:
