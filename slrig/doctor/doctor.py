@@ -29,7 +29,7 @@ from slrig.doctor.advice import (
     check_refresh_multiple,
     is_whole_periods,
 )
-from slrig.doctor.image import check_focus, check_sharpening, measure_response
+from slrig.doctor.image import check_calibrated, check_focus, check_sharpening, measure_response
 from slrig.doctor.light import (
     CameraSession,
     Finding,
@@ -313,6 +313,8 @@ class _DoctorRun:
     def _check_pictures(self) -> None:
         for name, light in self.lights.items():
             picture, findings = locate_picture(self._open_session(name), self.sequence, light, self.rig.calibration)
+            if not any(each.severity is Severity.FAULT for each in findings):
+                findings += check_calibrated(name, light, picture, self.rig.calibration)
             self.findings += findings
             blur_px, findings = check_focus(
                 name, self.sequence, light, picture, period_px=self.period_px, steps=self.steps, sines=self.sines

@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.doctor.advice import advise_lines
-from slrig.doctor.light import CameraSession, Finding, LightMeasurement, LocatedPicture, camera_label, fault, note, ok
+from slrig.doctor.light import (
+    MIN_CODE_SHARE,
+    MIN_CODE_SNR,
+    CameraSession,
+    Finding,
+    LightMeasurement,
+    LocatedPicture,
+    camera_label,
+    fault,
+    note,
+    ok,
+)
 from slrig.doctor.measures import (
     BarContrast,
     EdgeBlur,
@@ -24,14 +36,18 @@ from slrig.doctor.measures import (
     measure_halo,
 )
 from slrig.errors import DeviceError, DeviceGoneError
-from slrig.model import Axis, Black, Calibration, FloatArray, Pattern, PatternSequence, Size, White
-from slrig.patterns import edge_indices
+from slrig.model import Axis, Black, Calibration, FloatArray, Gray, Pattern, PatternSequence, Size, White, gray_index
+from slrig.patterns import cell_centre_px, edge_indices
 
 _WHOLE_PERIODS = 4
 _MIN_BAR_PIXELS = 200
 _NOTE_CONTRAST, _FAULT_CONTRAST = 0.5, 0.25
 _CAMERA_SHARE, _PROJECTOR_SHARE = 0.6, 0.35
 _BORDER_PX = 12
+
+_MIN_CERTAIN = 0.5  # share of the pixels by which a bit can be read
+_MAX_PAIRS = 20_000
+_NOTE_DISAGREEMENT_PX = 1.0
 
 _NOTE_OVERSHOOT, _FAULT_OVERSHOOT = 0.01, 0.04
 _MIN_OVERSHOOT_SNR = 4.0
@@ -162,6 +178,69 @@ def _defocused_device(edges: EdgeBlur | None, total_px: float) -> tuple[str, str
         return "projector", f"It is the projector's lens: {measured}, far less than the bars are", remedy
     remedy = "focus the projector until the patterns are sharp on the object, then the camera, or close its aperture"
     return "both", f"Both lenses contribute: {measured}", remedy
+
+
+# ---- Calibration
+
+
+def check_calibrated(
+    name: str, light: LightMeasurement, picture: LocatedPicture, calibration: Calibration | None
+) -> list[Finding]:
+    """Look whether columns and rows agree by the calibration: a zoom, overscan or keystone correction that was changed
+    since, and a device that was moved, show; one that was there when it was made is part of it.
+    """
+    # Takes two seconds to import, and is needed here only.
+    from slrig.reconstruction import PixelPairs, check_calibration
+
+    pinholes = None if calibration is None else (calibration.cameras.get(name), calibration.projector)
+    if pinholes is None or pinholes[0] is None or pinholes[1] is None:
+        return []
+    code, camera_px, projector_px = _decoded_pixels(light, picture)
+    # A point is anywhere within its cells.
+    sigma_px = np.full(len(camera_px), math.hypot(*(each.cell_px for each in code)) / math.sqrt(12))
+    pairs = PixelPairs(camera_px, projector_px, sigma_px, Axis.COLUMN).thinned(_MAX_PAIRS)
+    check = check_calibration(pinholes[0], pinholes[1], pairs, code)
+    if check is None:
+        return []
+    message = (
+        f"by the calibration of {camera_label(name)}, columns and rows disagree by {check.median_px:.1f} projector "
+        f"pixels (median of {check.pairs} points)"
+    )
+    if not check.is_refuted and check.systematic_px <= _NOTE_DISAGREEMENT_PX:
+        return [ok("picture.calibrated", "projector", message)]
+    remedy = (
+        "switch keystone correction, digital zoom and overscan off, or set them as they were when it was calibrated; "
+        "if nothing of that was changed, a device was moved or its lens turned: slrig verify, or calibrate again"
+    )
+    kind = fault if check.is_refuted else note
+    return [kind("picture.calibrated", "projector", f"{message}{check.cause and f': {check.cause}'}", remedy)]
+
+
+def _decoded_pixels(
+    light: LightMeasurement, picture: LocatedPicture
+) -> tuple[tuple[Gray, ...], FloatArray, FloatArray]:
+    """The codes of both axes as far as their bits can be read, and (n, 2) pixels of camera and projector."""
+    levels, mask = light.levels, picture.known
+    threshold = np.maximum(MIN_CODE_SHARE * levels.contrast, MIN_CODE_SNR * levels.noise_dn)
+    codes: list[Gray] = []
+    positions: list[FloatArray] = []
+    for axis in Axis:
+        read: list[NDArray[np.bool_]] = []
+        bars = sorted((each for each in picture.bars if each.pattern.axis is axis), key=lambda each: each.pattern.bit)
+        for each in bars:
+            certain = mask & (np.abs(each.difference) > threshold)
+            if np.count_nonzero(certain) < _MIN_CERTAIN * np.count_nonzero(mask):
+                break
+            mask = certain
+            read.append(each.difference > 0)
+        if not read:
+            return (), np.empty((0, 2)), np.empty((0, 2))
+        first = bars[0].pattern
+        code = replace(first, bit=0, bits=len(read), cell_px=first.cell_px * 2 ** (first.bits - len(read)))
+        codes.append(code)
+        positions.append(cell_centre_px(gray_index(np.stack(read)), cell_px=code.cell_px, offset_px=code.offset_px))
+    camera_px = np.argwhere(mask)[:, ::-1].astype(np.float64)
+    return tuple(codes), camera_px, np.column_stack([each[mask] for each in positions])
 
 
 # ---- Sharpening

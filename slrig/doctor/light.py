@@ -65,8 +65,8 @@ _SHORT_EXPOSURE_SHARE = 0.25
 _MAX_AMBIENT_SHARE = 0.5
 
 _COARSE_BITS = 6
-_MIN_CODE_SHARE = 0.25
-_MIN_CODE_SNR = 5.0
+MIN_CODE_SHARE = 0.25
+MIN_CODE_SNR = 5.0
 _MAX_TURN_DEG = 60.0
 _MIN_CAMERA_PX = 0.5
 _MIN_PROJECTOR_SHARE = 0.1
@@ -525,7 +525,7 @@ def locate_picture(
         cell_px[axis] = first.cell_px * 2 ** (first.bits - len(coarse))
         index = gray_index(np.stack([each.difference > 0 for each in coarse]))
         position_px[axis] = cell_centre_px(index, cell_px=cell_px[axis], offset_px=first.offset_px)
-        threshold = np.maximum(_MIN_CODE_SHARE * light.levels.contrast, _MIN_CODE_SNR * light.levels.noise_dn)
+        threshold = np.maximum(MIN_CODE_SHARE * light.levels.contrast, MIN_CODE_SNR * light.levels.noise_dn)
         for each in coarse:
             known &= np.abs(each.difference) > threshold
     orientation = None

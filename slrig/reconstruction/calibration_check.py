@@ -576,7 +576,7 @@ def _trials(
     if fit is not None and fit.turned_deg < _MAX_TURN_DEG:
         cause = (
             "the projector has another pose relative to the camera than the calibration says: turned by "
-            f"{fit.turned_deg:.2f}° and shifted by {fit.shifted_mm:.1f} mm"
+            f"{fit.turned_deg:.2f}° and shifted by {fit.shifted_mm:.1f} mm (a keystone correction looks the same)"
         )
         yield _Mistake(cause, fit.camera, fit.projector, pairs, 2)
 
@@ -700,8 +700,10 @@ def _scaled(
     what = f"of another resolution than its matrix: × {1 / scale:.3f}"
     yield _Mistake(f"the {name} is {what}", camera, projector, transformed(scale, shift), 1)
     scale, shift = fit(lambda x: (float(np.exp(x[0])), (1 - float(np.exp(x[0]))) * middle), _SCALES)
-    what = f"zoomed about its middle: × {1 / scale:.3f}"
-    yield _Mistake(f"the {name} is {what}", camera, projector, transformed(scale, shift), 1)
+    what = f"the {name} is zoomed about its middle: × {1 / scale:.3f}"
+    if not of_camera:
+        what = f"the projector shows its picture × {scale:.3f} as large about its middle: overscan or digital zoom"
+    yield _Mistake(what, camera, projector, transformed(scale, shift), 1)
     scale, shift = fit(lambda x: (1.0, extent * x), shifts)
     what = f"shifted by {-shift[0]:.0f}, {-shift[1]:.0f} px: another region, crop or offset"
     yield _Mistake(f"the {name} is {what}", camera, projector, transformed(scale, shift), 2)

@@ -19,7 +19,7 @@ from simulated_rig.device import SimulatedHead, open_head
 from slrig.devices import AppliedSettings, Camera, CameraSettings, Projector, Rig, Trigger
 from slrig.doctor import timing
 from slrig.doctor.doctor import Diagnosis, doctor_sequence, examine
-from slrig.doctor.image import check_sharpening, measure_response
+from slrig.doctor.image import check_calibrated, check_sharpening, measure_response
 from slrig.doctor.light import CameraSession, Finding, Severity, locate_picture, measure_light
 from slrig.doctor.measures import depth_mm_per_px
 from slrig.errors import FrameTimeoutError, ScanEvidenceError, UnsupportedByDeviceError
@@ -283,22 +283,59 @@ def test_frames_that_contradict_are_shot_once_more(rig: Rig, late: Container[int
             assert np.array_equal(found_px[picture.known], other.position_px[axis][picture.known])
 
 
-class LimitedProjector:
-    """A rendered projector that takes full-range values for video levels, 16 to 235."""
+class ProcessingProjector:
+    """A rendered projector that makes another picture of each."""
 
-    def __init__(self, projector: Projector) -> None:
+    def __init__(self, projector: Projector, process: Process) -> None:
         self._projector = projector
+        self._process = process
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._projector, name)
 
     def load(self, sequence: PatternSequence) -> None:
-        spread = (grey((profile - 16.0) * 255 / 219) for profile in sequence.profiles)
-        self._projector.load(PatternSequence(sequence.projector, sequence.patterns, tuple(spread)))
+        processed = tuple(map(self._process, sequence.profiles))
+        self._projector.load(PatternSequence(sequence.projector, sequence.patterns, processed))
+
+
+def processing(rig: Rig, process: Process) -> Rig:
+    return replace(rig, projector=cast("Projector", ProcessingProjector(rig.projector, process)))
+
+
+def limited(profile: Pixels) -> Pixels:
+    """Full-range values taken for video levels, 16 to 235."""
+    return grey((profile - 16.0) * 255 / 219)
+
+
+def zoomed(profile: Pixels) -> Pixels:
+    """Enlarged by a tenth about its middle, as by overscan."""
+    place = [np.clip((np.arange(n) + 0.5 - n / 2) / 1.1 + n / 2 - 0.5, 0, n - 1) for n in profile.shape]
+    rows, columns = np.meshgrid(*(each.astype(np.float32) for each in place), indexing="ij")
+    return np.asarray(cv2.remap(profile, columns, rows, cv2.INTER_LINEAR), np.uint8).reshape(profile.shape)
 
 
 @pytest.mark.parametrize(
-    ("response", "gamma", "limited", "names"),
+    ("process", "severity", "words"),
+    [(lambda profile: profile, Severity.OK, "disagree by 0."), (zoomed, Severity.FAULT, "overscan or digital zoom")],
+)
+def test_zoom_that_was_changed_since_the_calibration_is_named(
+    printed: Rig, process: Process, severity: Severity, words: str
+) -> None:
+    rig = processing(printed, process)
+    session = CameraSession(rig, "eye", wait_s=0.05)
+    sequence = doctor_sequence(rig.projector.info.size)
+    light, _ = measure_light(session, sequence, displays="")
+    assert light is not None
+    picture, findings = locate_picture(session, sequence, light, rig.calibration)
+    assert [each for each in findings if each.severity is Severity.FAULT] == []
+    [found] = check_calibrated("eye", light, picture, rig.calibration)
+    assert found.severity is severity
+    assert words in found.found
+    assert check_calibrated("eye", light, picture, None) == []
+
+
+@pytest.mark.parametrize(
+    ("response", "gamma", "is_limited", "names"),
     [
         (0.6, 2.2, False, {"response.gamma", "response.camera"}),
         (0.6, 1.0, False, {"response.straight", "response.camera"}),
@@ -307,18 +344,17 @@ class LimitedProjector:
     ],
 )
 def test_what_the_camera_makes_of_light_is_not_blamed_on_the_projector(
-    tmp_path: Path, response: float, gamma: float, limited: bool, names: set[str]
+    tmp_path: Path, response: float, gamma: float, is_limited: bool, names: set[str]
 ) -> None:
     with small_rig(tmp_path, eye=EYE | {"response": response}, lamp=LAMP | {"gamma": gamma}, ambient=0.1) as rig:
-        used = replace(rig, projector=cast("Projector", LimitedProjector(rig.projector))) if limited else rig
-        session = CameraSession(used, "eye", wait_s=0.05)
+        session = CameraSession(processing(rig, limited) if is_limited else rig, "eye", wait_s=0.05)
         light, _ = measure_light(session, doctor_sequence(rig.projector.info.size), displays="")
         assert light is not None
         curve, findings = measure_response(session, light)
     assert curve is not None
     assert {each.name for each in findings} == names
     assert curve.gamma == pytest.approx(gamma, abs=0.06)
-    assert (curve.black_knee, curve.white_knee) == pytest.approx((16, 235) if limited else (0, 255), abs=3)
+    assert (curve.black_knee, curve.white_knee) == pytest.approx((16, 235) if is_limited else (0, 255), abs=3)
 
 
 def grey(values: FloatArray) -> Pixels:

@@ -130,6 +130,9 @@ def exchanged_bits(pairs: PixelPairs) -> FloatArray:
     return np.column_stack([word, pairs.projector_px[:, 1]])
 
 
+MIDDLE = np.array([399.5, 249.5])
+
+
 MISTAKES: dict[str, tuple[Callable[[PixelPairs], Case], str]] = {
     "inverse pose": (lambda p: (CAMERA, inverse_pose(PROJECTOR), p), "the inverse pose"),
     "lenses exchanged": (
@@ -157,6 +160,10 @@ MISTAKES: dict[str, tuple[Callable[[PixelPairs], Case], str]] = {
     "code with an offset": (
         lambda p: (CAMERA, PROJECTOR, replace(p, projector_px=p.projector_px + np.array([112, 6]))),
         "projected code is shifted by 112, 6 px",
+    ),
+    "overscan": (
+        lambda p: (CAMERA, PROJECTOR, replace(p, projector_px=(p.projector_px - MIDDLE) / 1.05 + MIDDLE)),
+        "shows its picture × 1.050 as large about its middle: overscan",
     ),
     "bits exchanged": (
         lambda p: (CAMERA, PROJECTOR, replace(p, projector_px=exchanged_bits(p))),
