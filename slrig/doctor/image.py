@@ -234,7 +234,7 @@ def _decoded_pixels(
             mask = certain
             read.append(each.difference > 0)
         if not read:
-            return (), np.empty((0, 2)), np.empty((0, 2))
+            return (), np.zeros((0, 2)), np.zeros((0, 2))
         first = bars[0].pattern
         code = replace(first, bit=0, bits=len(read), cell_px=first.cell_px * 2 ** (first.bits - len(read)))
         codes.append(code)
