@@ -189,6 +189,7 @@ LIVE = {
     "webcams-and-hdmi": ("screen", ["v4l2", "v4l2"]),
     "oak-and-screen": ("screen", ["depthai", "depthai"]),
     "trigger-box-and-genicam": ("serial_projector", ["genicam"]),
+    "trigger-box-and-picamera2": ("serial_projector", ["picamera2"]),
     "lightcrafter-4500-and-two-cameras": ("dlpc350", ["genicam", "genicam"]),
     "lightcrafter-6500-and-two-cameras": ("dlpc900", ["genicam", "genicam"]),
 }

@@ -102,6 +102,11 @@ STAND_INS = (
         "&& slrig import teapot --projector 256x192 --camera left --yes --output teapot-bundle",
         "the demonstration in Gray code alone, in smaller pictures, takes the place of another program's images",
     ),
+    StandIn(
+        "make -C arduino flash PORT=/dev/ttyACM0",
+        "grep -q avrdude arduino/Makefile",
+        "needs an Arduino; tests/unit/drivers/serial_projector/test_arduino.py compiles it for one in a simulator",
+    ),
     StandIn("pytest tests/bench/test_pipeline_speed.py -s", None, "measures speed: nothing else may run beside it"),
     StandIn("pytest tests/bench -s", None, "takes an hour, on a machine that does nothing else"),
 )
