@@ -22,12 +22,8 @@ from tests.contract import (
     serial_bench,
     v4l2_bench,
 )
-from tests.contract.stage import Stage, StagedProjector
-from tests.contract.suite import Bench, BenchHead, rig_of, sequence_for
-from tests.unit.capture import fake_rig
-from tests.unit.capture.fake_rig import Scene
-from tests.unit.drivers.picamera2.fake_picamera2 import Pi
-from tests.virtual_clock import VirtualClock
+from tests.contract.picamera2_bench import picamera2, wired_picamera2
+from tests.contract.suite import Bench, rig_of, sequence_for
 
 PROJECTOR = Size(96, 72)
 
@@ -97,17 +93,6 @@ def replayed(folder: Path, **options: object) -> Bench:
     return Bench(partial(replay.open_head, {"bundle": "recording", **options}, folder), bench.sequence)
 
 
-def picamera2(_: Path) -> Bench:
-    """The driver on a stand-in for the library, with a mono sensor of 10 bit, on virtual time."""
-
-    def open_head() -> BenchHead:
-        clock = VirtualClock()
-        pi = Pi(Stage(Scene(noise_dn=0.8, bit_depth=10), latency_s=0.002, jitter_s=0.003, clock=clock))
-        return BenchHead({"left": pi.opened()}, StagedProjector(pi.stage), clock=clock)
-
-    return Bench(open_head, sequence_for(fake_rig.PROJECTOR))
-
-
 BENCHES: dict[str, Callable[[Path], Bench]] = {
     "simulated": simulated,
     "simulated in real time": partial(simulated, realtime=True),
@@ -120,6 +105,7 @@ BENCHES: dict[str, Callable[[Path], Bench]] = {
     "gentl (a producer of our own)": gentl_bench.bench,
     "depthai (host-only)": depthai_bench.bench,
     "picamera2 (a stand-in for the library)": picamera2,
+    "picamera2 by wire": wired_picamera2,
     "dlpc347x": dlpc347x_bench.bench,
     "dlpc350": dlpc350_bench.bench,
     "dlpc900": dlpc900_bench.bench,

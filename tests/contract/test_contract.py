@@ -10,10 +10,11 @@ import pytest
 
 from slrig.conformance import CHECKS, Check, CheckOutcome, ConformanceRun
 from slrig.devices import Camera, HasClock, Projector, ScannerHead
-from tests.contract.benches import BENCHES, picamera2
+from tests.contract.benches import BENCHES
+from tests.contract.picamera2_bench import picamera2
 from tests.contract.suite import Bench
 
-VIRTUAL = ("simulated", "replay", "v4l2 (fake kernel)", "picamera2 (a stand-in for the library)")
+VIRTUAL = ("simulated", "replay", "v4l2 (fake kernel)", "picamera2 (a stand-in for the library)", "picamera2 by wire")
 """Benches on virtual time. The others take as long as their devices would, ten seconds and more; where a busy machine
 keeps the thread of their light waiting, a frame shows two patterns.
 """

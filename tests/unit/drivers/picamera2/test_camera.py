@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -25,9 +24,10 @@ from slrig.errors import (
     UnsupportedByDeviceError,
 )
 from slrig.model import Frame, Size
+from tests.contract.picamera2_bench import connect, global_shutter
 from tests.contract.stage import Stage
 from tests.unit.capture.fake_rig import Scene
-from tests.unit.drivers.picamera2.fake_picamera2 import BLANK_US, CONTROLS, Pi
+from tests.unit.drivers.picamera2.fake_picamera2 import BLANK_US, Pi
 from tests.unit.drivers.serial_projector.conftest import SEQUENCE, Bench
 from tests.virtual_clock import VirtualClock
 
@@ -167,11 +167,8 @@ def trigger_mode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return file
 
 
-def wired(clock: VirtualClock | None = None, **scene: Any) -> Pi:
-    """A Raspberry Pi with a global-shutter camera, whose limits are those that libcamera 0.2 reports."""
-    stage = Stage(Scene(camera=SIZE, bit_depth=10, **scene), clock=clock or VirtualClock())
-    limits = {"ExposureTime": (29, 0, 0), "FrameDurationLimits": (16_562, 15_534_385, 33_333)}
-    return Pi(stage, model="imx296", controls={**CONTROLS, **limits}, pulses=deque())
+def wired(clock: VirtualClock, **scene: Any) -> Pi:
+    return global_shutter(Scene(camera=SIZE, bit_depth=10, **scene), clock)
 
 
 @pytest.mark.usefixtures("trigger_mode")
@@ -223,15 +220,7 @@ def test_a_sensor_that_is_switched_otherwise_is_refused(
 def test_a_trigger_box_and_a_global_shutter_camera_scan_by_wire(make_bench: Callable[..., Bench]) -> None:
     box = make_bench()
     where = wired(box.clock, projector=SEQUENCE.projector, columns_per_px=SEQUENCE.projector.width_px / SIZE.width_px)
-    pulses = where.pulses
-    assert pulses is not None
-    where.look = box.line.catch_up
-
-    def light(pattern: int | None) -> None:
-        where.stage.show(None if pattern is None else SEQUENCE.profiles[pattern], asked_ns=box.scene.now_ns())
-
-    box.scene.watch.append(light)
-    box.scene.on_pulse.append(lambda us: pulses.append((box.scene.now_ns(), box.scene.now_ns() + us * 1000)))
+    connect(where, box)
     projector = box.open()
     assert projector.info.pulses_expose
     with opened(where, external_trigger=True) as camera:
