@@ -266,7 +266,8 @@ def _samples(data: Bytes, layout: PixelLayout, size: Size, stride_bytes: int) ->
     if largest >> layout.bit_depth:
         message = (
             f"a sample of {largest} came, and {layout.bit_depth} bits hold {2**layout.bit_depth - 1} at most: this "
-            f"receiver stores samples shifted up, as those of Jetson do; write sample_shift = {16 - layout.bit_depth}"
+            f"receiver stores samples shifted up, as those of Jetson do; write sample_shift = {16 - layout.bit_depth}, "
+            "or what its documents say"
         )
         raise CorruptFrameError(message)
     return image

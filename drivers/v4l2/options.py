@@ -34,7 +34,7 @@ class V4L2Options(Strict, use_attribute_docstrings=True):
 
     sample_shift: Annotated[int, Field(ge=0, le=8)] = 0
     """Bits by which samples are shifted up in their 16-bit words (10 to 14 bits), the bits below repeating the upper
-    ones: 6 for 10 bits on Jetson Xavier and Orin (NVIDIA's technical reference, "RAW pixel formatting to memory")."""
+    ones: 6 for 10 bits that fill the upper ones, as on Jetson Xavier and later; 0 on Jetson Nano."""
 
     limited_luma: bool = False
     """True if the camera sends luma as 16 to 235 (YUV formats): it is expanded to 0 to 255."""
