@@ -76,7 +76,8 @@ dim so far answers ERR 4 bright 1000. Its answer contains
                                  lit beyond its exposure; shortest exposure
     pick=                        maximum patterns of PICK; a box without this word has no PICK, and loads runs only
     pulse=exposure               the cameras' pulse lasts as long as the exposure, for cameras that expose for its
-                                 length; without this word it has a length of the box's own
+                                 length, and ends with the light at the latest; without this word it has a length of
+                                 the box's own
 
 gap_us in HELLO is for patterns in the order of the flash; LOAD returns that of the sequence, longer if it steps back.
 

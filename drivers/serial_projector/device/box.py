@@ -33,7 +33,7 @@ class BoxHardware:
         raise NotImplementedError
 
     def switch_off(self) -> None:
-        """Switch the light off, and return when it is off."""
+        """Switch the light off, end a pulse to the cameras that still lasts, and return when it is off."""
         raise NotImplementedError
 
     def pulse(self, us: int) -> None:

@@ -135,8 +135,9 @@ class PicoBoard(BoxHardware):
         self._time.sleep_us(LAMP_US)
 
     def switch_off(self) -> None:
-        """See `BoxHardware`."""
+        """See `BoxHardware`. Ends a pulse that still lasts."""
         self._lamp.duty_u16(0)
+        self._camera.restart()
         self._time.sleep_us(LAMP_US)
 
     def pulse(self, us: int) -> None:
@@ -162,12 +163,12 @@ def _pulses(machine, rp2):
     @rp2.asm_pio(set_init=rp2.PIO.OUT_LOW if CAMERA_LEVEL else rp2.PIO.OUT_HIGH)
     def program(level=CAMERA_LEVEL, at_rest=1 - CAMERA_LEVEL) -> None:
         # MicroPython takes the module's names away while it assembles this.
+        set(pins, at_rest)
         pull(block)
         mov(x, osr)
         set(pins, level)
         label("on")
         jmp(x_dec, "on")
-        set(pins, at_rest)
 
     camera = rp2.StateMachine(0, program, freq=1000000, set_base=machine.Pin(CAMERA_PIN))
     camera.active(1)

@@ -115,6 +115,15 @@ const char *board_pulse(uint32_t us) {
     return NULL;
 }
 
+// End a pulse that still lasts: the light went out before its time.
+static void end_pulse(void) {
+    ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+        left_ticks = 0;
+        OCR1A = TCNT1 + 32;
+        TCCR1A = AT_REST;
+    }
+}
+
 // The engine.
 
 static int16_t position = -1;
@@ -156,6 +165,7 @@ const char *board_light(void) {
 
 const char *board_switch_off(void) {
     PORTD &= ~_BV(LAMP);
+    end_pulse();
     _delay_us(LAMP_US);
     return NULL;
 }

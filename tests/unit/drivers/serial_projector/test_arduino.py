@@ -144,6 +144,17 @@ def test_pulses_last_what_was_ordered_to_the_timers_tick(make: Make, level: int)
             assert 2000 <= (off - on) / CYCLES_PER_US - exposure_s * 1e6 <= 3000
         periods_us = [(later - earlier) / CYCLES_PER_US for (earlier, _), (later, _) in pairwise(pulses)]
         assert max(abs(each - exposure_s * 1e6 - 12_000) for each in periods_us) < 1000
+    # A pulse ends with its light, so that the next play's first one is whole.
+    projector.play(0.0985, 0.12)
+    board.clock.advance(0.05)
+    board.catch_up()
+    board.changes.clear()
+    projector.stop()
+    board.clock.advance(0.05)
+    board.catch_up()
+    gone, rest = board.changes
+    assert (gone[1:], rest[1:]) == (("lamp", 0), ("camera", 1 - level))
+    assert rest[0] - gone[0] <= 40 * CYCLES_PER_US
     projector.close()
 
 

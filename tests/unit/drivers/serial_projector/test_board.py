@@ -56,27 +56,37 @@ class Pico:
                 self.pin.value(level)
 
         class StateMachine:
-            """Runs the program, one word per µs."""
+            """Runs the program, one word per µs, from one `pull` to the next."""
 
             def __init__(self, number: int, program: object, freq: int, set_base: Pin) -> None:
-                self.us, self.pin, self.is_active = 1000000 // freq, set_base, 0
+                self.us, self.pin = 1000000 // freq, set_base
 
             def active(self, active: int) -> None:
-                self.is_active = active
+                assert active
+                self.restart()
+
+            def restart(self) -> None:
+                """Begin anew; what it would have done later is not done."""
+                board.did = [each for each in board.did if each[0] <= board.now_us]
+                self.at = 0
+                self.run(None)
 
             def put(self, word: int) -> None:
                 """Give it a word: it runs until it wants the next one."""
-                assert self.is_active
-                at, x, osr, t_us = 0, 0, 0, board.now_us
+                self.run(word)
+
+            def run(self, word: int | None) -> None:
+                x, osr, t_us = 0, 0, board.now_us
                 program = board.program
                 while True:
-                    name, words = program[at][0], program[at][1:]
-                    at += 1
+                    name, words = program[self.at][0], program[self.at][1:]
+                    if name == "pull" and word is None:
+                        return
+                    self.at = (self.at + 1) % len(program)
                     t_us += self.us
                     if name == "pull":
-                        if osr:
-                            return
-                        osr = word
+                        assert word is not None
+                        osr, word = word, None
                     elif name == "mov":
                         assert words == ("x", "osr")
                         x = osr
@@ -86,11 +96,10 @@ class Pico:
                         assert words[0] == "x_dec"
                         x, again = x - 1, x > 0
                         if again:
-                            at = program.index(("label", words[1]))
+                            self.at = program.index(("label", words[1]))
                     elif name == "label":
                         # No instruction: it takes no time.
                         t_us -= self.us
-                    at %= len(program)
 
         class PIO:
             """Its levels."""
@@ -217,6 +226,11 @@ def test_the_cameras_get_a_pulse_as_long_as_the_exposure(
         assert (begun, ended) == (f"{main.CAMERA_PIN}={level}", f"{main.CAMERA_PIN}={1 - level}")
         # The sensor adds 14.26 µs.
         assert end_us - begin_us == us - 14
+    # The light goes out before its time.
+    board.pulse(5_000)
+    pico.now_us += 1_000
+    board.switch_off()
+    assert pico.did[-1] == (pico.now_us - main.LAMP_US + 1, f"{main.CAMERA_PIN}={1 - level}")
 
 
 def test_its_time_never_wraps(pico: Pico, board: main.PicoBoard) -> None:
