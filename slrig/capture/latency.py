@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,11 @@ _MIN_GAP_SPREADS = 0.5
 """Between late flashes and the others, in spreads of the others. The last of n flashes of a uniform law is as far from
 the others with probability (2/3)ⁿ⁻², which is 2 % for 12 of them."""
 _MIN_GAP_S = 2e-3  # waiting for so little longer costs nothing
+
+_STAND_ROWS = 8  # of a frame, for the fit of a stand
+_MAX_STAND_S, _MIN_STAND_S, _STANDS_S = 0.1, 3e-3, (0.004, 0.012, 0.03)
+_MIN_STAND_LIGHT = 0.1  # between black, 0, and white, 1
+_BETTER = 0.65  # of the squares that a ramp leaves: 0.2 to 0.6 for one refresh at 60 Hz, 0.8 and more for all else
 
 _WHITE, _BLACK = 0, 1
 _STEADY_FRAMES = 8  # of white and of black, for mean, noise and period
@@ -128,7 +134,7 @@ class CameraLatency:
 
     A picture that missed its refresh is late once and again, and no scan waits for that: all but flashes, rows_used
     and residual_s are of the flashes without the `late` ones, the first of which came late_s after the last of the
-    others.
+    others. halfway_s : for how long the light stands between white and black; 0 where it does not.
 
     latency_s : mean of the flashes, ± standard_error_s; jitter_s : their standard deviation; latency_p95_s : their 95th
     percentile. rise_s, fall_s : means of the flashes to white and to black, NaN without any. settle_s : duration of the
@@ -159,6 +165,7 @@ class CameraLatency:
     flicker: float
     late: int = 0
     late_s: float = 0.0
+    halfway_s: float = 0.0
 
     @property
     def late_words(self) -> str:
@@ -287,6 +294,7 @@ def fit_latency(camera: str, flashes: Sequence[LightChange], levels: RowLevels) 
         flicker=levels.flicker,
         late=int(late.sum()),
         late_s=late_s,
+        halfway_s=_halfway_s([flash for flash, is_late in zip(used, late, strict=True) if not is_late], usual, slope_s),
     )
 
 
@@ -303,6 +311,58 @@ def _late_flashes(latencies_s: FloatArray, rising: NDArray[np.bool_]) -> tuple[N
         if gap_s > max(_MIN_GAP_SPREADS * float(np.ptp(others_s)), _MIN_GAP_S):
             return np.isin(np.arange(len(order)), order[-late:]), gap_s
     return np.zeros(len(order), np.bool_), 0.0
+
+
+def _halfway_s(flashes: Sequence[LightChange], latencies_s: FloatArray, line_time_s: float) -> float:
+    """Return how long light stands halfway in each change: where that fits far better than a step or a ramp, which slow
+    displays and uncertain instants give; else 0.
+    """
+    # Imported here as in `fit_latency`.
+    from scipy.optimize import least_squares
+
+    begin, exposure, progress, rising = np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, np.bool_)
+    for to_white in (True, False):
+        kind = [number for number, flash in enumerate(flashes) if flash.to_white is to_white]
+        # Of all flashes: that of one depends on the part of the change that was exposed.
+        latency_s = float(np.mean(latencies_s[kind])) if kind else 0.0
+        for flash in (flashes[number] for number in kind):
+            rows = np.flatnonzero(np.isfinite(flash.progress).all(axis=0))
+            rows = rows[:: max(len(rows) // _STAND_ROWS, 1)]
+            start = flash.starts_s[:, None] + line_time_s * rows - latency_s
+            exposures = np.broadcast_to(flash.exposures_s[:, None], start.shape)
+            near = (start < _MAX_STAND_S) & (start + exposures > -_MAX_STAND_S)
+            begin, exposure = np.append(begin, start[near]), np.append(exposure, exposures[near])
+            progress = np.append(progress, flash.progress[:, rows][near])
+            rising = np.append(rising, np.full(np.count_nonzero(near), to_white))
+
+    def share(light: Callable[[FloatArray], FloatArray]) -> FloatArray:
+        """Share of the new light in each exposure, of the integral of the light since the change."""
+        return (light(begin + exposure) - light(begin)) / exposure - progress
+
+    # Each by the centroid of the change, which the latency is.
+    def ramp(law: FloatArray) -> FloatArray:
+        at_s, length_s = law[0] - law[1] / 2, law[1]
+        return share(
+            lambda t: np.clip(t - at_s, 0, length_s) ** 2 / (2 * length_s) + np.maximum(t - at_s - length_s, 0)
+        )
+
+    def stand(law: FloatArray) -> FloatArray:
+        first = np.where(rising, law[2], 1 - law[2])
+        at_s = law[0] - law[1] * (1 - first)
+        return share(lambda t: first * np.maximum(t - at_s, 0) + (1 - first) * np.maximum(t - at_s - law[1], 0))
+
+    def fitted(law: Callable[[FloatArray], FloatArray], *more: float) -> Any:
+        limits = (-_MAX_STAND_S, 1e-5, *(0.0 for _ in more)), (_MAX_STAND_S, _MAX_STAND_S, *(1.0 for _ in more))
+        fits = [
+            least_squares(law, (0.0, length_s, *more), x_scale=(0.01, 0.01, *more), bounds=limits)
+            for length_s in _STANDS_S
+        ]
+        return min(fits, key=lambda fit: float(fit.cost))
+
+    by_ramp, by_stand = fitted(ramp), fitted(stand, 0.5)
+    length_s, white = (float(each) for each in by_stand.x[1:])
+    is_stand = length_s > _MIN_STAND_S and _MIN_STAND_LIGHT < white < 1 - _MIN_STAND_LIGHT
+    return length_s if is_stand and by_stand.cost < _BETTER * by_ramp.cost else 0.0
 
 
 def _line_time(flashes: Sequence[TransitionRows]) -> tuple[float, float]:

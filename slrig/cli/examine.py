@@ -275,6 +275,8 @@ def _latency_words(found: CameraLatency) -> str:
     ]
     if found.late:
         said.append(found.late_words)
+    if found.halfway_s:
+        said.append(f"between white and black it stands halfway for {ms['halfway_s']}: interpolated pictures")
     if found.flicker > STEADY_TOLERANCE:
         said.append(f"steady white flickers by {found.flicker:.0%}: make the exposure a multiple of the refresh period")
     return "\n".join(f"  {line}" for line in said)

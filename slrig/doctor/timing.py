@@ -149,7 +149,11 @@ def measure_light_latency(
             measured = measure_latency(watching, trials=_FLASHES, search_s=search_s, on_progress=progress)
     except ScanEvidenceError as error:
         return None, [check_punctuality(watching, each, error) for each in lights.values()]
-    findings = [_check_latency(measured, rig.synchronisation), *_check_jitter(measured, lights)]
+    findings = [
+        _check_latency(measured, rig.synchronisation),
+        *_check_jitter(measured, lights),
+        *_check_interpolation(measured),
+    ]
     for name, camera in measured.cameras.items():
         findings.append(_describe_shutter(name, camera, lights[name].skew_s, rig.synchronisation))
     return measured, findings
@@ -259,6 +263,21 @@ def _check_jitter(measured: LatencyMeasurement, lights: Mapping[str, LightMeasur
         "the latest light and stay right"
     )
     return [note("timing.jitter", "projector", message, remedy)]
+
+
+def _check_interpolation(measured: LatencyMeasurement) -> list[Finding]:
+    halfway_s = max(camera.halfway_s for camera in measured.cameras.values())
+    if not halfway_s:
+        return []
+    message = (
+        f"between white and black its light stands halfway for {format_ms(halfway_s)}: it shows pictures that nobody "
+        "sent, mixed from one pattern and the next"
+    )
+    remedy = (
+        "switch off frame interpolation (motion smoothing, frame creation) in its menu, or choose its game or PC mode; "
+        "scans wait for it and stay right, only slower"
+    )
+    return [note("timing.interpolated", "projector", message, remedy)]
 
 
 def _describe_shutter(name: str, camera: CameraLatency, skew_s: float, known: Synchronisation | None) -> Finding:

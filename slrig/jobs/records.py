@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from itertools import pairwise
@@ -186,7 +186,7 @@ _record_adapter = TypeAdapter(JobRecord)
 
 def write_record(folder: Path, record: JobRecord) -> None:
     """Write the record of a finished job into its folder, for a database that was lost. Raises StorageError."""
-    write_file(folder / RECORD, _record_adapter.dump_json(replace(record, has_files_json=True), indent=1))
+    write_file(folder / RECORD, _record_adapter.dump_json(record, indent=1))
 
 
 def read_record(folder: Path) -> JobRecord | None:

@@ -361,6 +361,37 @@ def test_a_flash_that_came_late_asks_for_more(tmp_path: Path, monkeypatch: pytes
     assert measure_latency(usual, trials=10).cameras["eye"].flashes_used == DEFAULT_TRIALS
 
 
+def halfway(at_s: float, length_s: float, level: float) -> Callable[[bool, np.random.Generator], Light]:
+    """Light that stands at a level for a time, on its way to white and on that to black."""
+
+    def light(to_white: bool, _: np.random.Generator) -> Light:
+        def white(t: FloatArray) -> FloatArray:
+            return np.select([t < at_s, t < at_s + length_s], [0.0, level if to_white else 1 - level], 1.0)
+
+        return white if to_white else lambda t: 1 - white(t)
+
+    return light
+
+
+@pytest.mark.parametrize("line_s", [0.0, 1e-4])
+@pytest.mark.parametrize(
+    ("light", "length_s"),
+    [
+        (halfway(0.01, 1 / 60, 0.5), 1 / 60),
+        (halfway(0.01, 1 / 60, 0.22), 1 / 60),
+        (both_ways(step(0.01)), 0.0),
+        (both_ways(ramp(0.01, 0.012)), 0.0),
+        (lambda to_white, rng: both_ways(step(0.004 + float(rng.uniform(0, 1 / 60))))(to_white, rng), 0.0),
+        (lambda to_white, rng: both_ways(step(0.004 + float(rng.normal(0, 0.004))))(to_white, rng), 0.0),
+    ],
+)
+def test_a_picture_between_white_and_black_is_seen(
+    light: Callable[[bool, np.random.Generator], Light], length_s: float, line_s: float
+) -> None:
+    found = World(light, exposure_s=1 / 30, period_s=1 / 30, line_s=line_s).measured(count=24, seed=1)
+    assert found.halfway_s == pytest.approx(length_s, abs=1.5e-3)
+
+
 def test_a_ramp_is_timed_at_its_middle_and_waited_for_to_its_end() -> None:
     found = World(both_ways(ramp(0.010, 0.008)), exposure_s=0.02, period_s=0.022).measured()
     assert found.latency_s == pytest.approx(0.014, abs=1e-3)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from simulated_rig.device import SimulatedHead, open_head
+from slrig.capture import measure_latency
 from slrig.devices import AppliedSettings, Camera, CameraSettings, Projector, Rig, Trigger
 from slrig.doctor import timing
 from slrig.doctor.doctor import Diagnosis, doctor_sequence, examine
@@ -219,6 +220,19 @@ def test_exposure_that_a_dim_camera_declares_and_refuses_ends_the_search_alone(r
     diagnosis = run_doctor(camera)
     assert names(diagnosis, Severity.FAULT) == set()
     assert {"exposure.range", "timing.late", "flicker.none"} <= names(diagnosis, Severity.OK)
+
+
+@pytest.mark.parametrize("halfway_s", [0.0, 1 / 60])
+def test_pictures_that_nobody_sent_are_named(rig: Rig, monkeypatch: pytest.MonkeyPatch, halfway_s: float) -> None:
+    found = measure_latency(rig, trials=8)
+    eye = replace(found.cameras["eye"], halfway_s=halfway_s)
+    monkeypatch.setattr(timing, "measure_latency", lambda *_, **__: replace(found, cameras={"eye": eye}))
+    light, _ = measure_light(CameraSession(rig, "eye"), doctor_sequence(rig.projector.info.size), displays="")
+    assert light is not None
+    _, findings = timing.measure_light_latency(rig, {"eye": light}, {"eye": light.exposure_s}, search_s=0.1, progress=lambda *_: None)
+    said = [each.found for each in findings if each.name == "timing.interpolated"]
+    assert len(said) == (halfway_s > 0)
+    assert all("stands halfway for 16.7 ms" in each for each in said)
 
 
 def test_rig_without_calibration_has_its_picture_checked_and_its_drivers_notes_reported(rig: Rig) -> None:

@@ -134,7 +134,7 @@ def finished(folder: DataFolder, record: JobRecord) -> None:
     place.mkdir()
     (place / "mesh.ply").write_bytes(b"ply")
     (place / "report.json").write_text("{}")
-    write_record(place, replace(record, state=JobState.SUCCEEDED, summary=SUMMARY))
+    write_record(place, replace(record, state=JobState.SUCCEEDED, summary=SUMMARY, has_files_json=True))
     write_entries(place)
 
 
