@@ -475,8 +475,10 @@ def capture_frames(
         except (ScanEvidenceError, FrameTimeoutError) as error:
             recorder.finish()
             writer.keep(str(error))
+            # Light that comes later than the projector states gives frames of the pattern before.
+            late = "".join(f". Or {words}" for words in _unmeasured(rig) if isinstance(error, ScanEvidenceError))
             message = (
-                f"{error}. The frames are kept: see bundle.json for those that counted, {REFUSED_FOLDER}/ for "
+                f"{error}{late}. The frames are kept: see bundle.json for those that counted, {REFUSED_FOLDER}/ for "
                 "the others"
             )
             raise type(error)(message) from error
@@ -502,14 +504,19 @@ def _turned(rig: Rig, plan: ScanPlan, progress: ProgressCallback) -> TurntableAn
 def _of_the_rig(rig: Rig) -> list[str]:
     """What drivers tell of their cameras, and what was not measured."""
     told = [f"camera '{name}': {words}" for name, camera in rig.cameras.items() for words in camera.info.notes]
+    return told + _unmeasured(rig)
+
+
+def _unmeasured(rig: Rig) -> list[str]:
+    """That the light's delay was not measured, where it counts."""
     free = [name for name, trigger in choose_triggers(rig).items() if trigger is Trigger.FREE]
-    if free and rig.synchronisation is None:
-        told.append(
-            "how late the projector's light is was never measured on this rig, and it has cameras that run by "
-            f"themselves ({', '.join(free)}): their frames are matched to patterns by what the drivers state. Run "
-            "slrig latency, and write the [synchronisation] that it prints into the rig file"
-        )
-    return told
+    if not free or rig.synchronisation is not None:
+        return []
+    return [
+        "how late the projector's light is was never measured on this rig, and it has cameras that run by themselves "
+        f"({', '.join(free)}): their frames are matched to patterns by what the drivers state. Run slrig latency, and "
+        "write the [synchronisation] that it prints into the rig file"
+    ]
 
 
 def _detail(exposing: Exposing) -> str:

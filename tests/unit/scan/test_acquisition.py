@@ -127,6 +127,17 @@ def test_a_rig_whose_latency_was_never_measured_says_so(tmp_path: Path) -> None:
     assert not (tmp_path / "triggered" / "notes.json").exists()
 
 
+@pytest.mark.parametrize("measured", [None, Synchronisation(0.0, 0.001)])
+def test_frames_that_light_is_too_late_for_ask_to_measure_it(tmp_path: Path, measured: Synchronisation | None) -> None:
+    plan = ScanPlan(PatternPlan(line_shift=False, gray_cell_px=16))
+    with small_rig(tmp_path, faults={"light_delay_s": 0.15}) as rig:
+        free = {"eye": OtherCamera(rig.cameras["eye"], triggers=frozenset({Trigger.FREE}))}
+        late = replace(rig, cameras=free, synchronisation=measured)
+        with pytest.raises(ScanEvidenceError) as raised:
+            capture_frames(late, plan, tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False)
+    assert ("never measured on this rig" in str(raised.value)) is (measured is None)
+
+
 def test_the_turntable_turns_before_the_first_frame_and_the_bundle_says_where_to(tmp_path: Path) -> None:
     fake, table = fake_rig(cameras=["left"]), FakeTurntable()
     on_stage = replace(fake, rig=replace(fake.rig, positioner=table))
