@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from zipfile import ZipFile
 
 import pytest
 
@@ -56,3 +57,7 @@ def test_streams_of_a_command_end_with_it(tmp_path: Path, name: str) -> None:
     assert [reader for reader in readers if reader.is_alive()] == []
     # What it says, and to refuse, is of other tests.
     assert code in {0, 1, 2, -signal.SIGKILL}, b"".join(said)
+    if name == "report":
+        with ZipFile(tmp_path / "bench.zip") as packed:
+            found = {"doctor.json", "latency.json", "conformance.json", "scan-2/report.json", "service.log"}
+            assert found <= set(packed.namelist())
