@@ -207,7 +207,9 @@ def serve(
 
 def _beat(heartbeat: c_double) -> None:
     """Tell that this process lives, until the service does not: a kernel that compiles would go on for minutes."""
-    waiting, service = threading.Event(), os.getppid()
+    parent = multiprocessing.parent_process()
+    # The service may have ended while this process was loading: its parent is another one then.
+    waiting, service = threading.Event(), os.getppid() if parent is None else parent.pid
     while not waiting.wait(HEARTBEAT_S):
         heartbeat.value = time.monotonic()
         if os.getppid() != service:

@@ -17,7 +17,8 @@ from tests.e2e.conftest import write_rig
 
 pytestmark = pytest.mark.slow
 
-PATIENCE_S = 2.0
+PATIENCE_S = {"killed": 6.0}
+"""Else 2 s. A worker that is being loaded looks after its service only then."""
 SERVE = ["serve", "rig.toml", "--port", "0", "--data", "data"]
 COMMANDS = {
     "devices": ["devices"],
@@ -53,7 +54,7 @@ def test_streams_of_a_command_end_with_it(tmp_path: Path, name: str) -> None:
         reader.start()
     code = command.wait(300)
     for reader in readers:
-        reader.join(PATIENCE_S)
+        reader.join(PATIENCE_S.get(name, 2.0))
     assert [reader for reader in readers if reader.is_alive()] == []
     # What it says, and to refuse, is of other tests.
     assert code in {0, 1, 2, -signal.SIGKILL}, b"".join(said)

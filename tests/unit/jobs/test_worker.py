@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterator
 from ctypes import c_double
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -52,6 +53,7 @@ from slrig.jobs.worker import (
     UnexpectedWorkerError,
     Unloadable,
     Worker,
+    _beat,
     prepare_kernel_cache,
     serve,
 )
@@ -591,3 +593,23 @@ def test_cancel_ends_a_process_that_is_stuck_in_a_frame(
     fed(again, *SHOTS)
     assert run(again) == [2, 2, True]
     assert worker.process_id != before
+
+
+def test_a_worker_whose_service_ended_while_it_was_loaded_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Ended(BaseException):
+        pass
+
+    class Heart:
+        def __setattr__(self, name: str, value: float) -> None:
+            assert not self.__dict__.setdefault("beats", 0)
+            self.__dict__["beats"] += 1
+
+    def end(_code: int) -> None:
+        raise Ended
+
+    monkeypatch.setattr("slrig.jobs.worker.HEARTBEAT_S", 0.0)
+    monkeypatch.setattr("os._exit", end)
+    # Its parent is another process by then.
+    monkeypatch.setattr("multiprocessing.parent_process", lambda: SimpleNamespace(pid=os.getppid() + 1))
+    with pytest.raises(Ended):
+        _beat(cast("c_double", Heart()))
