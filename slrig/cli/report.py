@@ -103,23 +103,20 @@ def write_report(rig_file: Path | None, service: ServiceOptions, output: Path, *
     Raises ConfigError: the file exists, there is no such rig file, or the file of the key cannot be read; StorageError.
     """
     refuse_existing(output, force=force)
-    running, staging = service.client(), staging_name(output)
+    staging = staging_name(output)
     with TemporaryDirectory(prefix="slrig-") as folder, storage_errors(output), progress_shown() as display:
         scratch = Path(folder)
         try:
             with ZipFile(staging, "w", ZIP_DEFLATED) as file:
                 parts = _Parts(file, display)
                 parts.add("versions.json", lambda _: {"versions.json": _json(_versions())})
-                parts.add(
-                    "devices.json",
-                    lambda _: {"devices.json": _json(devices_document(installed_drivers(), discover_devices()))},
-                )
+                parts.add("devices.json", lambda _: {"devices.json": _json(_devices())})
                 parts.add("tools.txt", lambda _: {"tools.txt": _tools()})
                 parts.add("dmesg.txt", lambda _: {"dmesg.txt": _kernel_log()})
                 if rig_file is not None:
                     parts.add("rig.toml", lambda _: {"rig.toml": read_text(rig_file, _MOST_BYTES, ConfigError)})
                 try:
-                    with running if rig_file is None else rig_service(rig_file, scratch, display) as client:
+                    with service.client() if rig_file is None else rig_service(rig_file, scratch, display) as client:
                         _add_rig(parts, client, scratch, pictures=pictures)
                 except ServiceError as error:
                     parts.missing["all of the rig itself"] = str(error)
