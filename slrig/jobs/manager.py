@@ -733,9 +733,8 @@ class JobManager:
         if place is not None:
             record = self.store.get(work.id)
             state = JobState.SUCCEEDED if outcome.fault is None else JobState.FAILED
-            ended = {"state": state, "summary": outcome.summary, "fault": outcome.fault}
-            record = replace(record, **ended, has_files_json=True)
-            write_record(self.data.staging(work.id), record)
+            record = replace(record, state=state, summary=outcome.summary, fault=outcome.fault)
+            write_record(self.data.staging(work.id), replace(record, has_files_json=True))
             self.data.put(work.id, place)
         group = self.groups.get(work.job.kind)
         if group is None:

@@ -229,7 +229,9 @@ def test_pictures_that_nobody_sent_are_named(rig: Rig, monkeypatch: pytest.Monke
     monkeypatch.setattr(timing, "measure_latency", lambda *_, **__: replace(found, cameras={"eye": eye}))
     light, _ = measure_light(CameraSession(rig, "eye"), doctor_sequence(rig.projector.info.size), displays="")
     assert light is not None
-    _, findings = timing.measure_light_latency(rig, {"eye": light}, {"eye": light.exposure_s}, search_s=0.1, progress=lambda *_: None)
+    _, findings = timing.measure_light_latency(
+        rig, {"eye": light}, {"eye": light.exposure_s}, search_s=0.1, progress=lambda *_: None
+    )
     said = [each.found for each in findings if each.name == "timing.interpolated"]
     assert len(said) == (halfway_s > 0)
     assert all("stands halfway for 16.7 ms" in each for each in said)
