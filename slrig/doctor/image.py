@@ -56,6 +56,7 @@ GREY_LEVELS = 33
 _GREY_FRAMES = 2
 _GAMMA_TOLERANCE = 0.1
 _EXPONENT_TOLERANCE = 0.1
+_CAMERA_EXPONENTS = (0.3, 3.0)  # of a camera that has a tone curve
 _MAX_KNEE = 10.0
 _MAX_REVERSAL = 0.03
 _ALL_WHITE = 0.9
@@ -307,9 +308,11 @@ def measure_response(session: CameraSession, light: LightMeasurement) -> tuple[R
         return None, [ok("response.binary", "projector", message)]
     exponent = _camera_exponent(session, light, sequence)
     camera = [] if exponent is None else [_check_camera_linearity(session.name, exponent)]
-    # What the camera makes of light is not the projector's fault: bent darks look like a limited range.
-    is_bent = exponent is not None and abs(exponent - 1) > _EXPONENT_TOLERANCE
-    shares = _measure_greys(session, light, sequence, exponent if exponent is not None and is_bent else 1.0)
+    # What the camera makes of light is not the projector's fault: bent darks look like a limited range. One whose values
+    # do not follow the exposure has no curve that could be undone.
+    least, most = _CAMERA_EXPONENTS
+    is_curve = exponent is not None and least < exponent < most and abs(exponent - 1) > _EXPONENT_TOLERANCE
+    shares = _measure_greys(session, light, sequence, exponent if exponent is not None and is_curve else 1.0)
     if shares[1] > _ALL_WHITE:
         message = "it shows every grey as white: nothing bends black and white"
         return None, [ok("response.binary", "projector", message), *camera]
