@@ -308,8 +308,8 @@ def measure_response(session: CameraSession, light: LightMeasurement) -> tuple[R
         return None, [ok("response.binary", "projector", message)]
     exponent = _camera_exponent(session, light, sequence)
     camera = [] if exponent is None else [_check_camera_linearity(session.name, exponent)]
-    # What the camera makes of light is not the projector's fault: bent darks look like a limited range. One whose values
-    # do not follow the exposure has no curve that could be undone.
+    # What the camera makes of light is not the projector's fault: bent darks look like a limited range. One whose
+    # values do not follow the exposure has no curve that could be undone.
     least, most = _CAMERA_EXPONENTS
     is_curve = exponent is not None and least < exponent < most and abs(exponent - 1) > _EXPONENT_TOLERANCE
     shares = _measure_greys(session, light, sequence, exponent if exponent is not None and is_curve else 1.0)
