@@ -592,7 +592,7 @@ def devices_document(drivers: Sequence[InstalledDriver], found: DiscoveredDevice
     """What `slrig devices --json` prints."""
     return {
         "drivers": [asdict(driver) for driver in drivers],
-        "devices": [asdict(device) for device in found.devices],
+        "devices": [{key: each for key, each in asdict(device).items() if each != {}} for device in found.devices],
         "missing": [asdict(library) for library in found.missing],
         "broken": [asdict(package) for package in broken_packages(drivers)],
         "elsewhere": [asdict(driver) for driver in found.elsewhere],
