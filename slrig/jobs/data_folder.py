@@ -401,6 +401,7 @@ class DataFolder:
         """
         if not os.path.lexists(place):
             return
+        self._forget(place)
         gone = trash or self.incoming / f"gone-{uuid4().hex}"
         with disk_errors(place):
             place.rename(gone)
@@ -446,8 +447,13 @@ class DataFolder:
     def withdraw(self, place: Path, job_id: UUID) -> None:
         """Take the files of a job back into staging by one rename: the first half of a deletion."""
         if os.path.lexists(place):
+            self._forget(place)
             with disk_errors(place):
                 place.rename(self.staging(job_id))
+
+    def _forget(self, place: Path) -> None:
+        """Forget which files in a folder that goes were found whole."""
+        self._whole = {path: looked for path, looked in self._whole.items() if not path.is_relative_to(place)}
 
 
 def missing_files(place: Path, promised: Iterable[str]) -> list[str]:

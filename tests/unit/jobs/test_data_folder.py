@@ -289,6 +289,19 @@ def test_start_says_which_files_of_a_scan_are_damaged(
     assert name in record.fault.message
 
 
+def test_what_was_found_whole_is_forgotten_with_its_folder(store: JobStore, folder: DataFolder) -> None:
+    places = []
+    for _ in range(2):
+        scan_id = running(store, JobState.COMPUTING)
+        finished(folder, store.get(scan_id))
+        places.append(folder.scan(scan_id))
+        folder.require_whole(places[-1], "mesh.ply", "report.json")
+    folder.remove(places[0])
+    assert {path.parent for path in folder._whole} == {places[1]}
+    folder.withdraw(places[1], UUID(places[1].name))
+    assert folder._whole == {}
+
+
 def test_every_changed_bit_is_found_and_no_file_that_came_later(tmp_path: Path) -> None:
     (tmp_path / "bundle").mkdir()
     for name in ("mesh.ply", "bundle/000.png"):
