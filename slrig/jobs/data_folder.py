@@ -367,8 +367,7 @@ class DataFolder:
         looked = {}
         for name in names:
             with suppress(OSError):
-                found = (place / name).stat()
-                looked[place / name] = (found.st_ino, found.st_size, found.st_mtime_ns)
+                looked[place / name] = _stamp_of(place / name)
         unknown = [each for each in names if self._whole.get(place / each) != looked.get(place / each, ())]
         if unknown:
             require_whole(place, *unknown, remedy="They are not given out.")
@@ -386,8 +385,7 @@ class DataFolder:
         if entry is None or path.is_symlink():
             return False
         with suppress(OSError):
-            found = path.stat()
-            looked = (found.st_ino, found.st_size, found.st_mtime_ns)
+            looked = _stamp_of(path)
             if self._whole.get(path) == looked or file_entry(path) == entry:
                 self._whole[path] = looked
                 return True
@@ -454,6 +452,12 @@ class DataFolder:
     def _forget(self, place: Path) -> None:
         """Forget which files in a folder that goes were found whole."""
         self._whole = {path: looked for path, looked in self._whole.items() if not path.is_relative_to(place)}
+
+
+def _stamp_of(path: Path) -> tuple[int, int, int]:
+    """What is another one once a file was changed or replaced. Raises OSError."""
+    found = path.stat()
+    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def missing_files(place: Path, promised: Iterable[str]) -> list[str]:
