@@ -8,8 +8,6 @@ DATA/acceptance/ID/report.html, report.json   when every position is measured; t
 from __future__ import annotations
 
 import json
-import shutil
-import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -193,10 +191,7 @@ class AcceptanceStore:
 
     def delete(self, test_id: UUID) -> None:
         """Remove a test with all its files: by one rename out of place first. Raises StorageError."""
-        gone = self._data.incoming / f"gone-{uuid.uuid4().hex}"
-        with disk_errors(self.folder(test_id)):
-            self.folder(test_id).rename(gone)
-        shutil.rmtree(gone, ignore_errors=True)
+        self._data.remove(self.folder(test_id))
 
     def _settled(self, record: AcceptanceRecord) -> AcceptanceRecord:
         """The record of a test that was cut off between its report and its record; the same object if it was not."""

@@ -33,7 +33,7 @@ from slrig.errors import (
 from slrig.failure import job_failure
 from slrig.jobs.data_folder import BUNDLE, FILES, DataFolder, read_entries
 from slrig.jobs.records import JobKind, JobRecord, JobState
-from slrig.jobs.worker import Task
+from slrig.jobs.worker import REQUEST_WAIT_S, Task
 from slrig.scan.artefacts import MESH, ON_REQUEST, REPORT, converted, write_converted
 from slrig.scan.formats import (
     BUNDLE_ZIP,
@@ -46,9 +46,6 @@ from slrig.scan.formats import (
     requested_forms,
 )
 from slrig.scan.job import cloud_bytes
-
-LONGEST_WAIT_S = 30.0
-"""From when on a request that waits for the worker is told to come again: clients wait a minute for an answer."""
 
 # A cloud takes the worker half a second and some hundred megabytes: one at a time, whoever asks.
 _making = threading.Lock()
@@ -341,7 +338,7 @@ def _serve_cloud(form: str) -> Callable[..., Awaitable[Response]]:
     async def made(service: Service, scan_id: UUID, camera: str | None, known: str | None) -> Response:
         name = form.format(camera=camera)
         if not await run_in_threadpool(service.folder.has_made, service.folder.scan(scan_id), name):
-            make = partial(_make_cloud, service, scan_id, form, camera, time.monotonic() + LONGEST_WAIT_S)
+            make = partial(_make_cloud, service, scan_id, form, camera, time.monotonic() + REQUEST_WAIT_S)
             await service.clouds.of((scan_id, name), make)
         return await run_in_threadpool(_cloud, service, scan_id, form, camera, known)
 

@@ -603,11 +603,11 @@ def test_scan_is_one_bag_of_all_its_cameras(client: TestClient, served: ServedBe
 def test_request_waits_for_its_turn_and_not_for_ever(
     client: TestClient, scan: str, busy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(clouds, "LONGEST_WAIT_S", 0.05)
+    monkeypatch.setattr(clouds, "REQUEST_WAIT_S", 0.05)
     refused = client.get(f"/scan/{scan}/{NAME}")
     assert (refused.status_code, refused.json()["type"]) == (503, "/problems/worker-busy")
     assert (refused.headers["Retry-After"], NAME in refused.json()["detail"]) == ("5", True)
-    monkeypatch.setattr(clouds, "LONGEST_WAIT_S", WAIT_S)
+    monkeypatch.setattr(clouds, "REQUEST_WAIT_S", WAIT_S)
     with ThreadPoolExecutor(2) as pool:
         asked = [pool.submit(client.get, f"/scan/{scan}/{NAME}") for _ in range(2)]
         assert not any(each.done() for each in asked)
