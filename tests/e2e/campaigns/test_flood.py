@@ -137,6 +137,9 @@ class Person:
         self.answers[answer.status_code] += 1
         return answer
 
+    def close(self) -> None:
+        self.http.close()
+
     def scans(self, count: int) -> tuple[float, list[str]]:
         """Seconds that so many scans take, one after the other, and the state of each."""
         begun_s, states = time.monotonic(), []
@@ -154,16 +157,16 @@ def test_a_key_that_may_only_look_takes_nothing_from_others(start: Start, tmp_pa
     service = start(write_rig(tmp_path / "rig", head=SLOW), SLRIG_REQUESTS_PER_S="50")
     ring = KeyRing(service.data / "keys.json")
     ann, look = ring.add("Ann", [KeyScope.SCAN]), ring.add("Look", [])
-    browser = httpx2.Client(base_url=service.url)
-    browser.post("/session", headers={"X-API-Key": ann})
-    # Until the worker is ready probes say so.
-    Person(service, ann).scans(2)
-    alone, beside = Person(service, ann), Person(service, ann)
-    finished = [scan["links"]["self"] for scan in alone.ask("GET", "/scan").json()["scans"]]
-    alone_s, states = alone.scans(SCANS)
-    stranger = multiprocessing.get_context("spawn").Process(target=greedy, args=(service.url, look, finished))
     with ExitStack() as held:
-        stream = httpx2.Client(base_url=service.url, headers={"X-API-Key": look}, timeout=60)
+        browser = held.enter_context(httpx2.Client(base_url=service.url))
+        browser.post("/session", headers={"X-API-Key": ann})
+        first, alone, beside = (held.enter_context(closing(Person(service, ann))) for _ in range(3))
+        # Until the worker is ready probes say so.
+        first.scans(2)
+        finished = [scan["links"]["self"] for scan in alone.ask("GET", "/scan").json()["scans"]]
+        alone_s, states = alone.scans(SCANS)
+        stranger = multiprocessing.get_context("spawn").Process(target=greedy, args=(service.url, look, finished))
+        stream = held.enter_context(httpx2.Client(base_url=service.url, headers={"X-API-Key": look}, timeout=60))
         silent = held.enter_context(stream.stream("GET", "/events"))
         assert silent.status_code == 200
         stranger.start()
