@@ -8,6 +8,9 @@ The residuals determine five of the six parameters of the relative pose (not the
 show errors of depth, too: `fit_calibration` searches the smallest change of pose and lenses that explains them, and
 `CalibrationFit.displacement_mm` what it means for each point. If the residuals are larger than any small change,
 `explain_residuals` tries mistakes that people and programs make, and names the one that brings agreement.
+
+Two cameras that decode both axes test their calibration in the same way without that of the projector: pixels that show
+one projector pixel are on each other's epipolar lines. The second camera takes the place of the projector then.
 """
 
 from __future__ import annotations
@@ -53,6 +56,9 @@ _IMPROVED = 0.7  # ratio of a cause's residual to that of the stated calibration
 _SIMPLER = 1.5  # a cause without free parameters is preferred up to this ratio of residuals
 _MAX_LENS_PX = 2.0  # residual of the best pose beyond which no small change of a lens helps
 _MAX_TURN_DEG = 20.0  # more is no device that moved a little
+_STRIPE_SIGMA_PX = 0.1  # of a stripe point
+_LENS_PX = 1.0  # residual that lens models of two cameras may leave
+_MAX_STEP_PX = 4.0  # between neighbouring points of a stripe, to interpolate between them
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,6 +143,65 @@ def find_cross_line_pairs(
     numbered = pair.copy()
     numbered[:, along] = first_px + steps * lines.line_width_px
     return replace(pairs, projector_px=numbered)
+
+
+def find_camera_pairs(first: PixelPairs, second: PixelPairs, cameras: tuple[Pinhole, Pinhole], /) -> PixelPairs:
+    """Pixels of two cameras that show the same projector pixel; those of the second are in `projector_px`.
+
+    first, second : camera and projector pixels of each camera. A projector pixel of the first is looked up on the
+    stripe of the second that has its position: at a point, or between two that are at most 4 px apart. The axis is that
+    of the second camera's image along which the baseline lies.
+    """
+    along = 0 if first.axis is Axis.COLUMN else 1
+    baseline = cameras[1].rotation @ (cameras[0].centre_mm - cameras[1].centre_mm)
+    axis = Axis.COLUMN if abs(baseline[0]) >= abs(baseline[1]) else Axis.ROW
+    # Complex numbers are in the order of their real parts, the position of the stripe, and then of the others.
+    wanted, keys = (each.projector_px[:, along] + 1j * each.projector_px[:, 1 - along] for each in (first, second))
+    if len(second) < 2:
+        return PixelPairs(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), axis)
+    order = np.argsort(keys, kind="stable")
+    keys, pixels = keys[order], second.camera_px[order]
+    step, apart = np.diff(keys), np.linalg.norm(np.diff(pixels, axis=0), axis=1)
+    joined = (step.real == 0) & (apart <= _MAX_STEP_PX)
+    after = np.clip(np.searchsorted(keys, wanted), 1, len(keys) - 1)
+    same = keys[after] == wanted
+    between = joined[after - 1] & (keys[after].real == wanted.real) & (keys[after - 1].real == wanted.real)
+    moved = joined & (step.imag > 0)
+    scale = float(np.median(apart[moved] / step.imag[moved])) if moved.any() else 1.0
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = np.where(same, 1.0, (wanted - keys[after - 1]).imag / step.imag[after - 1])
+    found = pixels[after - 1] + share[:, None] * (pixels[after] - pixels[after - 1])
+    sigma = np.hypot(scale * np.hypot(first.sigma_px, float(np.median(second.sigma_px))), _STRIPE_SIGMA_PX)
+    known = (same | between) & np.isfinite(found).all(axis=1)
+    return PixelPairs(first.camera_px, found, sigma, axis).take(known)
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceNames:
+    """What messages call the two devices that are tested, and what each of them makes.
+
+    is_pair : True if the second is a camera, too.
+    """
+
+    camera: str = "camera"
+    projector: str = "projector"
+    picture: str = "camera's picture"
+    image: str = "projected image"
+    code: str = "projected code"
+    is_pair: bool = False
+
+    @classmethod
+    def of_cameras(cls, first: str, second: str) -> DeviceNames:
+        """Those of two cameras, by their names."""
+        one, other = f"camera '{first}'", f"camera '{second}'"
+        return cls(one, other, f"picture of {one}", f"picture of {other}", f"picture of {other}", is_pair=True)
+
+    def the(self, device: str) -> str:
+        """A device in a sentence."""
+        return device if self.is_pair else f"the {device}"
+
+
+_CAMERA_AND_PROJECTOR = DeviceNames()
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,13 +323,14 @@ class CalibrationFit:
 class CalibrationCheck:
     """Residuals of both axes of one camera, and what explains them.
 
-    devices : camera and projector; pairs : number of points compared; sigma_px : median standard deviation of a
-    residual by noise and resolution; median_px : median absolute residual; systematic_px : rms of the means over the
-    8 x 8 cells of the image, less what noise adds. cause : mistake that explains residuals that refute the calibration,
-    empty if none is found or needed.
+    devices : camera and projector; axis : the one whose position gives the depth; pairs : number of points compared;
+    sigma_px : median standard deviation of a residual by noise and resolution; median_px : median absolute residual;
+    systematic_px : rms of the means over the 8 x 8 cells of the image, less what noise adds. cause : mistake that
+    explains residuals that refute the calibration, empty if none is found or needed.
     """
 
     devices: tuple[Pinhole, Pinhole]
+    axis: Axis
     pairs: int
     median_px: float
     systematic_px: float
@@ -287,7 +353,7 @@ class CalibrationCheck:
         implied_px = self.coded_error_px if is_large else 0.0
         return bool(self.cause) or not max(self.median_px, implied_px) <= limit_px
 
-    def error_mm(self, points_mm: FloatArray, normals: FloatArray, axis: Axis) -> FloatArray:
+    def error_mm(self, points_mm: FloatArray, normals: FloatArray) -> FloatArray:
         """(n,) float64: error along the normals (n, 3) that the residuals imply, as a standard deviation.
 
         That of the fit, with its own standard deviation; for a fit that is not significant, its standard deviation
@@ -296,18 +362,18 @@ class CalibrationCheck:
         """
         fit = self.explained if self._is_determined else None
         camera, projector = self.devices
-        pairs = PixelPairs(project(camera, points_mm), project(projector, points_mm), np.zeros(0), axis)
+        pairs = PixelPairs(project(camera, points_mm), project(projector, points_mm), np.zeros(0), self.axis)
         uncertain_px = self.median_px
         if fit is not None:
             uncertain_px = fit.coded_sigma_px
             if self.is_significant:
                 uncertain_px = min(uncertain_px, max(fit.coded_error_px, self.median_px))
-        pairs.projector_px[:, 0 if axis is Axis.COLUMN else 1] += uncertain_px
+        pairs.projector_px[:, 0 if self.axis is Axis.COLUMN else 1] += uncertain_px
         depth = coded_depth_mm(camera, projector, pairs)
         shifted = camera.centre_mm + depth[:, None] * pixel_rays(camera, pairs.camera_px) - points_mm
         error = np.abs((shifted * normals).sum(axis=1))
         if fit is not None and self.is_significant:
-            error = np.hypot(error, (fit.displacement_mm(points_mm, axis) * normals).sum(axis=1))
+            error = np.hypot(error, (fit.displacement_mm(points_mm, self.axis) * normals).sum(axis=1))
         return np.asarray(error)
 
     @property
@@ -342,23 +408,32 @@ class CalibrationCheck:
 
 
 def check_calibration(
-    camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, ...], /
+    camera: Pinhole,
+    projector: Pinhole,
+    pairs: PixelPairs,
+    code: tuple[Gray, ...],
+    /,
+    *,
+    names: DeviceNames = _CAMERA_AND_PROJECTOR,
 ) -> CalibrationCheck | None:
-    """Test the calibration of a camera and the projector; None for fewer than 200 correspondences.
+    """Test the calibration of a camera and the projector, or of two cameras; None for fewer than 200 correspondences.
 
-    code : Gray codes of the axes, to try exchanged bits.
+    code : Gray codes of the axes, to try exchanged bits; none for two cameras.
     """
     if len(pairs) < _MIN_POINTS:
         return None
     devices = camera, projector
     median, sigma = disagreement_px(*devices, pairs), float(np.median(pairs.sigma_px))
-    fit = fit_calibration(*devices, pairs) if median <= 4 * _REFUTED_PX else None
+    # Cameras side by side hardly show how they are turned towards each other: a fit would explain what lenses leave by
+    # a turn of much larger effect.
+    is_small = names.is_pair and median <= _LENS_PX
+    fit = fit_calibration(*devices, pairs) if median <= 4 * _REFUTED_PX and not is_small else None
     systematic = _systematic_px(*devices, pairs) if fit is not None else median
     mistake = _code_mistake(*devices, pairs, code)
-    check = CalibrationCheck(devices, len(pairs), median, systematic, sigma, fit, mistake)
+    check = CalibrationCheck(devices, pairs.axis, len(pairs), median, systematic, sigma, fit, mistake)
     if mistake or not check.is_refuted:
         return check
-    return replace(check, cause=explain_residuals(*devices, pairs, code))
+    return replace(check, cause=explain_residuals(*devices, pairs, code, names))
 
 
 def _code_mistake(camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, ...]) -> str:
@@ -373,7 +448,7 @@ def _code_mistake(camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: 
         return float(np.mean(~(np.abs(epipolar_residual_px(camera, projector, each)) <= _REFUTED_PX)))
 
     stated = far(pairs)
-    if stated < _MANY_FAR:
+    if not code or stated < _MANY_FAR:
         return ""
     left, cause = min((far(trial.pairs), trial.cause) for trial in _exchanged_bits(camera, projector, pairs, code))
     if left > _FEW_FAR * stated:
@@ -522,7 +597,9 @@ class _Mistake:
     free: int = 0
 
 
-def explain_residuals(camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, ...], /) -> str:
+def explain_residuals(
+    camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, ...], names: DeviceNames, /
+) -> str:
     """Name the mistake that brings the two axes into agreement, with the residual that it leaves; empty if none does.
 
     Of several, the one with fewest free parameters, unless its residual is 1.5 times that of another.
@@ -535,7 +612,7 @@ def explain_residuals(camera: Pinhole, projector: Pinhole, pairs: PixelPairs, co
         limit = min(limit, _SIMPLER * fit.residual_px + 0.05)
     stated = disagreement_px(camera, projector, pairs)
     agreeing: list[tuple[float, _Mistake]] = []
-    for trial in _trials(camera, projector, pairs, code, fit):
+    for trial in _trials(camera, projector, pairs, code, fit, names):
         if trial.free > 0 and agreeing and agreeing[0][1].free == 0:
             break  # fitting takes seconds, and could explain the same by a coincidence
         left = disagreement_px(trial.camera, trial.projector, trial.pairs)
@@ -547,36 +624,42 @@ def explain_residuals(camera: Pinhole, projector: Pinhole, pairs: PixelPairs, co
     likely = [found for found in agreeing if found[0] <= _SIMPLER * best + 0.02]
     likely.sort(key=lambda found: (found[1].free, found[0]))
     left = max(likely[0][0], 0.01)
-    names = " or ".join(
+    causes = " or ".join(
         trial.cause for _, trial in likely[:_MAX_CAUSES] if trial.free <= likely[0][1].free + _AS_SIMPLE
     )
-    return f"{names} (both axes then agree to {left:.2f} px)"
+    agree = "the cameras" if names.is_pair else "both axes"
+    return f"{causes} ({agree} then agree to {left:.2f} px)"
 
 
 def _trials(
-    camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, ...], fit: CalibrationFit | None
+    camera: Pinhole,
+    projector: Pinhole,
+    pairs: PixelPairs,
+    code: tuple[Gray, ...],
+    fit: CalibrationFit | None,
+    names: DeviceNames,
 ) -> Iterator[_Mistake]:
     """Mistakes to try, from those without a free parameter to the general ones."""
-    for name, moved in _other_poses(camera, projector):
+    for name, moved in _other_poses(camera, projector, names):
         yield _Mistake(f"the calibration holds {name}", camera, moved, pairs)
     lenses = _with_lens_of(camera, projector), _with_lens_of(projector, camera)
-    yield _Mistake("the lenses of camera and projector are exchanged in the calibration", *lenses, pairs)
-    for name, moved in _other_poses(*lenses):
-        yield _Mistake(
-            f"camera and projector are exchanged in the calibration, which holds {name}", lenses[0], moved, pairs
-        )
+    both = f"{names.camera} and {names.projector}"
+    yield _Mistake(f"the lenses of {both} are exchanged in the calibration", *lenses, pairs)
+    for name, moved in _other_poses(*lenses, names):
+        yield _Mistake(f"{both} are exchanged in the calibration, which holds {name}", lenses[0], moved, pairs)
     for name, transformed in _other_images(pairs.camera_px, camera.size):
-        yield _Mistake(f"the camera's picture is {name}", camera, projector, replace(pairs, camera_px=transformed))
+        yield _Mistake(f"the {names.picture} is {name}", camera, projector, replace(pairs, camera_px=transformed))
     for name, transformed in _other_images(pairs.projector_px, projector.size):
-        yield _Mistake(f"the projected image is {name}", camera, projector, replace(pairs, projector_px=transformed))
+        yield _Mistake(f"the {names.image} is {name}", camera, projector, replace(pairs, projector_px=transformed))
     yield from _exchanged_bits(camera, projector, pairs, code)
-    yield from _other_focal_lengths(camera, projector, pairs)
-    yield from _scaled(camera, projector, pairs, "camera's picture", of_camera=True)
-    yield from _scaled(camera, projector, pairs, "projected code", of_camera=False)
+    yield from _other_focal_lengths(camera, projector, pairs, names)
+    yield from _scaled(camera, projector, pairs, names.picture, of_camera=True)
+    yield from _scaled(camera, projector, pairs, names.code, of_camera=False, is_picture=names.is_pair)
     if fit is not None and fit.turned_deg < _MAX_TURN_DEG:
         cause = (
-            "the projector has another pose relative to the camera than the calibration says: turned by "
-            f"{fit.turned_deg:.2f}° and shifted by {fit.shifted_mm:.1f} mm (a keystone correction looks the same)"
+            f"{names.the(names.projector)} has another pose relative to {names.the(names.camera)} than the calibration "
+            f"says: turned by {fit.turned_deg:.2f}° and shifted by {fit.shifted_mm:.1f} mm"
+            + ("" if names.is_pair else " (a keystone correction looks the same)")
         )
         yield _Mistake(cause, fit.camera, fit.projector, pairs, 2)
 
@@ -586,16 +669,24 @@ def _with_lens_of(device: Pinhole, other: Pinhole) -> Pinhole:
     return replace(device, matrix=other.matrix, distortion=other.distortion)
 
 
-def _other_poses(camera: Pinhole, projector: Pinhole) -> Iterator[tuple[str, Pinhole]]:
+def _other_poses(camera: Pinhole, projector: Pinhole, names: DeviceNames) -> Iterator[tuple[str, Pinhole]]:
     """Poses of the projector relative to the camera that differ by a convention."""
     rotation = projector.rotation @ camera.rotation.T
     translation = projector.translation_mm - rotation @ camera.translation_mm
     for name, other, shift in (
-        ("the inverse pose (rotation and translation from projector to camera)", rotation.T, -rotation.T @ translation),
+        (
+            f"the inverse pose (rotation and translation from {names.projector} to {names.camera})",
+            rotation.T,
+            -rotation.T @ translation,
+        ),
         ("the rotation of the inverse direction", rotation.T, translation),
         ("the translation of the inverse direction", rotation, -translation),
-        ("the centre of the projector in place of its translation", rotation, -rotation @ translation),
-        ("the inverse rotation with the centre of the projector", rotation.T, -rotation.T @ -translation),
+        (f"the centre of {names.the(names.projector)} in place of its translation", rotation, -rotation @ translation),
+        (
+            f"the inverse rotation with the centre of {names.the(names.projector)}",
+            rotation.T,
+            -rotation.T @ -translation,
+        ),
     ):
         yield (
             name,
@@ -641,9 +732,11 @@ def _exchanged_bits(
             yield _Mistake(name, camera, projector, replace(pairs, projector_px=moved))
 
 
-def _other_focal_lengths(camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> Iterator[_Mistake]:
+def _other_focal_lengths(
+    camera: Pinhole, projector: Pinhole, pairs: PixelPairs, names: DeviceNames
+) -> Iterator[_Mistake]:
     """Another focal length of one device."""
-    for name, of_camera in (("camera", True), ("projector", False)):
+    for name, of_camera in ((names.camera, True), (names.projector, False)):
 
         def changed(x: FloatArray, of_camera: bool = of_camera) -> tuple[Pinhole, Pinhole]:
             device = camera if of_camera else projector
@@ -656,7 +749,7 @@ def _other_focal_lengths(camera: Pinhole, projector: Pinhole, pairs: PixelPairs)
             return epipolar_residual_px(*changed(x), pairs)
 
         found = _minimise(residual, _SCALES)
-        cause = f"the focal length of the {name} is × {np.exp(found[0]):.3f} that of the calibration"
+        cause = f"the focal length of {names.the(name)} is × {np.exp(found[0]):.3f} that of the calibration"
         yield _Mistake(cause, *changed(found), pairs, 1)
 
 
@@ -672,7 +765,7 @@ def _minimise(residual: Callable[[FloatArray], FloatArray], starts: Sequence[Flo
 
 
 def _scaled(
-    camera: Pinhole, projector: Pinhole, pairs: PixelPairs, name: str, *, of_camera: bool
+    camera: Pinhole, projector: Pinhole, pairs: PixelPairs, name: str, *, of_camera: bool, is_picture: bool = True
 ) -> Iterator[_Mistake]:
     """A picture of another resolution, zoomed, shifted, or both: p' = s (p + ½) - ½ + shift."""
     pixels = pairs.camera_px if of_camera else pairs.projector_px
@@ -701,7 +794,7 @@ def _scaled(
     yield _Mistake(f"the {name} is {what}", camera, projector, transformed(scale, shift), 1)
     scale, shift = fit(lambda x: (float(np.exp(x[0])), (1 - float(np.exp(x[0]))) * middle), _SCALES)
     what = f"the {name} is zoomed about its middle: × {1 / scale:.3f}"
-    if not of_camera:
+    if not is_picture:
         what = f"the projector shows its picture × {scale:.3f} as large about its middle: overscan or digital zoom"
     yield _Mistake(what, camera, projector, transformed(scale, shift), 1)
     scale, shift = fit(lambda x: (1.0, extent * x), shifts)

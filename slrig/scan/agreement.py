@@ -7,7 +7,8 @@ and added to the standard deviations, and points whose light came from elsewhere
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +22,10 @@ from slrig.reconstruction import (
     MAX_TURN_DEG,
     OUTLIER_SIGMA,
     CalibrationCheck,
+    DeviceNames,
     MergedCurves,
     PairRedundancy,
+    PixelPairs,
     Redundancy,
     RefinedPose,
     SheetCurves,
@@ -32,6 +35,7 @@ from slrig.reconstruction import (
     cell_numbers,
     check_calibration,
     evaluate_redundancy,
+    find_camera_pairs,
     intersect_light_sheets,
     merge_curves,
     noise_px,
@@ -40,7 +44,7 @@ from slrig.reconstruction import (
     sheet_coordinates,
     triangulate_camera_projector,
 )
-from slrig.scan.stream import CameraResult
+from slrig.scan.stream import CameraResult, SecondAxisResult
 
 _MAX_OVER_STATED = 3.0  # of the error found over the one stated, before it is said
 _MIN_CONTRADICTED = 0.002  # share of the points, before it is said
@@ -50,12 +54,23 @@ _MIN_CONTRADICTED = 0.002  # share of the points, before it is said
 class AxisAgreement:
     """What the second axis says of each camera: its check, or None where the axis was not played or shows too little.
 
-    notes : of cameras that were left out.
+    partners : without a projector's calibration, the camera that each one was tested with. notes : of cameras that were
+    left out.
     """
 
     axis: Axis
     checks: Mapping[str, CalibrationCheck | None]
     notes: tuple[str, ...] = ()
+    partners: Mapping[str, str] = field(default_factory=dict)
+
+    def tested(self, name: str) -> str:
+        """The devices of a check, in a sentence."""
+        partner = self.partners.get(name)
+        return f"camera '{name}'" if partner is None else f"cameras '{name}' and '{partner}'"
+
+    def compared(self, name: str) -> str:
+        """What a check compares with the calibration."""
+        return f"{self.axis.other}s" if name not in self.partners else "pixels that show the same column and row"
 
 
 def check_cameras(
@@ -70,16 +85,16 @@ def check_cameras(
     CalibrationError
         The second axis refutes the calibration of every camera.
     """
+    if projector is None:
+        return list(cameras), _check_pairs(folder, cameras, axis)
     checks: dict[str, CalibrationCheck | None] = {}
     for each in cameras:
         second = each.second
         checks[each.name] = (
-            None
-            if second is None or projector is None
-            else check_calibration(each.device, projector, second.pairs, second.codes)
+            None if second is None else check_calibration(each.device, projector, second.pairs, second.codes)
         )
     refuted = {name: check for name, check in checks.items() if check is not None and check.is_refuted}
-    reasons = [_refutation(name, check, axis) for name, check in refuted.items()]
+    reasons = [_refutation(AxisAgreement(axis, checks), name, check) for name, check in refuted.items()]
     remaining = [each for each in cameras if each.name not in refuted]
     if refuted and not remaining:
         raise CalibrationError(f"{folder}: " + "; ".join(reasons))
@@ -87,20 +102,58 @@ def check_cameras(
     return remaining, AxisAgreement(axis, checks, notes)
 
 
-def _refutation(name: str, check: CalibrationCheck, axis: Axis) -> str:
+def _check_pairs(folder: Path, cameras: Sequence[CameraResult], axis: Axis) -> AxisAgreement:
+    """Test cameras by one another: pixels that show one projector pixel are on each other's epipolar lines.
+
+    The projector needs no calibration for that. Raises CalibrationError if a pair is refuted.
+    """
+    checks: dict[str, CalibrationCheck | None] = {each.name: None for each in cameras}
+    partners: dict[str, str] = {}
+    coded = [(each, each.second) for each in cameras if each.second is not None]
+    for (one, pixels), (other, looked_up) in combinations(coded, 2):
+        pairs = find_camera_pairs(pixels.pairs, _all_pairs(other, looked_up), (one.device, other.device))
+        names = DeviceNames.of_cameras(one.name, other.name)
+        check = check_calibration(one.device, other.device, pairs, (), names=names)
+        earlier = checks[one.name]
+        if check is not None and (earlier is None or check.median_px > earlier.median_px):
+            checks[one.name], partners[one.name] = check, other.name
+    agreement = AxisAgreement(axis, checks, partners=partners)
+    refuted = {name: check for name, check in checks.items() if check is not None and check.is_refuted}
+    if refuted:
+        reasons = [_refutation(agreement, name, check) for name, check in refuted.items()]
+        raise CalibrationError(f"{folder}: " + "; ".join(reasons))
+    return agreement
+
+
+def _all_pairs(camera: CameraResult, second: SecondAxisResult) -> PixelPairs:
+    """Camera and projector pixels at all points of the stripes, or where they cross code edges if all that is read."""
+    if not second.is_dense or second.positions is None:
+        return second.pairs
+    ensemble = camera.curves.ensemble
+    coded = np.repeat(ensemble.position_px, np.diff(ensemble.offsets))
+    other, sigma = second.positions.sample(ensemble.points_px)
+    pair = (coded, other) if second.pairs.axis is Axis.COLUMN else (other, coded)
+    pairs = PixelPairs(ensemble.points_px, np.column_stack(pair), sigma, second.pairs.axis)
+    return pairs.take(np.isfinite(other))
+
+
+def _refutation(agreement: AxisAgreement, name: str, check: CalibrationCheck) -> str:
     """Say why a calibration is not that of the frames, and what to do."""
-    other = axis.other
-    where = f"{other}s are {check.median_px:.1f} px (median of {check.pairs} points) from where it puts them"
+    axis = agreement.axis
+    distance = f"{check.median_px:.1f} px (median of {check.pairs} points)"
+    where = f"{agreement.compared(name)} are {distance} from where it puts them"
     if not np.isfinite(check.median_px):
         where = "most rays do not meet in front of the devices, or the lenses cannot have imaged them"
-    implied = f", which means that {axis}s are off by {check.coded_error_px:.0f} px" if check.explained else ""
+    coded = f"pixels of camera '{agreement.partners[name]}'" if name in agreement.partners else f"{axis}s"
+    implied = f", which means that {coded} are off by {check.coded_error_px:.0f} px" if check.explained else ""
     cause = (
         f"Likeliest cause: {check.cause}. Correct that, or calibrate again"
         if check.cause
         else "No single mistake explains it: use the calibration of this rig, check that frames and patterns belong "
         "together, or calibrate again (slrig calibrate)"
     )
-    return f"the calibration contradicts the frames of camera '{name}', which show both axes: {where}{implied}. {cause}"
+    whose = f"{agreement.tested(name)}, which show both axes"
+    return f"the calibration contradicts the frames of {whose}: {where}{implied}. {cause}"
 
 
 def leave_out_contradicted(
@@ -157,33 +210,36 @@ def axis_test(
         check, own = agreement.checks.get(name), merged.camera == index
         if check is None or not own.any():
             continue
-        error = check.error_mm(points[own], normals[own], agreement.axis)
+        error = check.error_mm(points[own], normals[own])
+        compared, partner = agreement.compared(name), agreement.partners.get(name)
         known = error[np.isfinite(error)]
         typical, stated = float(np.median(known)) if len(known) else 0.0, float(np.nanmedian(stated_mm[own]))
         if not check.is_significant:
             hidden = f"; errors of it below {2 * typical:.2g} mm would not show" if len(known) else ""
-            results.append(f"{other}s agree with the calibration to {check.median_px:.2g} px{hidden}")
+            results.append(f"{compared} agree with the calibration to {check.median_px:.2g} px{hidden}")
             continue
         if typical <= _MAX_OVER_STATED * stated:
-            results.append(f"{other}s are {check.median_px:.2g} px from where the calibration puts them")
+            results.append(f"{compared} are {check.median_px:.2g} px from where the calibration puts them")
             continue
         added[own] = np.where(np.isfinite(error), error, typical)
         results.append(f"the error of {typical:.2g} mm that {other}s show")
         notes.append(
-            f"the {other}s contradict the calibration of camera '{name}': they are {check.median_px:.2f} px (median) "
-            f"from where it puts them, so that points are {typical:.3g} mm off (median), {typical / stated:.0f} times "
-            f"what is stated. This was added to the standard deviations, in squares; {_motion(check)}calibrate again"
+            f"the {other}s contradict the calibration of {agreement.tested(name)}: "
+            f"{compared if partner else 'they'} are {check.median_px:.2f} px (median) from where it puts them, so that "
+            f"points are {typical:.3g} mm off (median), {typical / stated:.0f} times what is stated. This was added to "
+            f"the standard deviations, in squares; {_motion(check, partner)}calibrate again"
         )
     return AxisTest(added, tuple(notes), "; ".join(results) or None)
 
 
-def _motion(check: CalibrationCheck) -> str:
-    """The motion of the projector that explains the residuals, for a note."""
+def _motion(check: CalibrationCheck, partner: str | None) -> str:
+    """The motion of the projector, or of the second camera, that explains the residuals, for a note."""
     fit = check.explained
     if fit is None:
         return ""
+    device, other = ("a projector", "camera") if partner is None else (f"camera '{partner}'", "other camera")
     return (
-        f"a projector turned by {fit.turned_deg:.2f}° and shifted by {fit.shifted_mm:.1f} mm relative to the camera "
+        f"{device} turned by {fit.turned_deg:.2f}° and shifted by {fit.shifted_mm:.1f} mm relative to the {other} "
         f"would agree to {fit.residual_px:.2f} px: "
     )
 

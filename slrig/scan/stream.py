@@ -77,6 +77,7 @@ from slrig.reconstruction import (
     find_cross_line_pairs,
     fuse_colour,
     fuse_exposures,
+    has_phase,
     linearise,
     mean_image,
     optical_depths_mm,
@@ -333,7 +334,8 @@ class SecondAxisResult:
     """Light of the axis that is not triangulated by, at one camera.
 
     positions : (H, W), projector position along that axis; None where only one frame of lines was played of it. pairs :
-    camera and projector pixels that both axes give; codes : Gray codes of the axes that have one. residual_px : (H, W)
+    camera and projector pixels that both axes give; codes : Gray codes of the axes that have one. is_dense : True if
+    positions are read between the edges of the code, too. residual_px : (H, W)
     float32, position minus its prediction by the calibration at each triangulated point, NaN elsewhere; None before
     triangulation and without positions.
     """
@@ -341,6 +343,7 @@ class SecondAxisResult:
     positions: AxisPositions | None
     pairs: PixelPairs
     codes: tuple[Gray, ...]
+    is_dense: bool = False
     residual_px: NDArray[np.float32] | None = None
 
 
@@ -578,7 +581,7 @@ class _CameraFrames:
             )))  # fmt: skip
         mine = self._patterns.gray
         codes = (mine, frames.gray) if self._axis is Axis.COLUMN else (frames.gray, mine)
-        return SecondAxisResult(positions, pairs, codes)
+        return SecondAxisResult(positions, pairs, codes, has_phase(second.frames))
 
     def _by_cross_lines(
         self, curves: CameraCurves, frames: AxisFrames, calibration: Calibration

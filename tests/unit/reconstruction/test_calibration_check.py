@@ -13,7 +13,15 @@ from scipy.interpolate import griddata
 from scipy.spatial.transform import Rotation
 
 from slrig.model import Axis, FloatArray, Gray, LineShift, Pinhole, Size
-from slrig.reconstruction import CalibrationCheck, CalibrationFit, PixelPairs, check_calibration, find_cross_line_pairs
+from slrig.reconstruction import (
+    CalibrationCheck,
+    CalibrationFit,
+    DeviceNames,
+    PixelPairs,
+    check_calibration,
+    find_camera_pairs,
+    find_cross_line_pairs,
+)
 from slrig.reconstruction.identification import StripeEnsemble
 
 CODES = Gray(Axis.COLUMN, 0, 10), Gray(Axis.ROW, 0, 9)
@@ -278,8 +286,58 @@ def test_an_error_that_the_rows_do_not_determine_refutes_nothing() -> None:
         devices, *devices, turned_deg=10.4, shifted_mm=8.3, residual_px=0.22, coded_error_px=434.0,
         coded_sigma_px=453.0, is_significant=True,
     )  # fmt: skip
-    found = CalibrationCheck(devices, 200_000, 0.47, 0.7, 0.1, fit)
+    found = CalibrationCheck(devices, Axis.COLUMN, 200_000, 0.47, 0.7, 0.1, fit)
 
     assert not found.is_refuted
     assert found.coded_error_px == 0.47
     assert replace(found, fit=replace(fit, coded_sigma_px=20.0)).is_refuted
+
+
+# ---- two cameras, and a projector without a calibration
+
+SECOND = device(Size(640, 512), 1390.0, (-1, 15, 1), np.array([180.0, 6.0, 12.0]), -0.07)
+NAMES = DeviceNames.of_cameras("left", "right")
+
+
+def of_a_code(camera: Pinhole, rows: FloatArray) -> PixelPairs:
+    """Pixels that show a wavy surface, on stripes one projector pixel apart. rows : (n,), along each of them."""
+    column, row = (each.ravel() for each in np.meshgrid(np.arange(60) + 0.5, rows, indexing="ij"))
+    x, y = (column - 30) * 3, (row - 40) * 2
+    pixels = opencv_pixels(camera, np.column_stack([x, y, 620 + 25 * np.sin(x / 40) * np.cos(y / 30)]))
+    pixels += np.random.default_rng(3).normal(0, 0.03, pixels.shape)
+    return PixelPairs(pixels, np.column_stack([column, row]), np.full(len(pixels), 0.03), Axis.COLUMN)
+
+
+def pair_check(second: Pinhole, rows: FloatArray, *, is_mirrored: bool = False) -> CalibrationCheck:
+    """Test a second camera, as the calibration has it, by pictures that it mirrored left to right, or not."""
+    first, other = of_a_code(CAMERA, np.arange(10, 70) + 0.5), of_a_code(SECOND, rows)
+    if is_mirrored:
+        other = replace(other, camera_px=mirrored(other))
+    check = check_calibration(CAMERA, second, find_camera_pairs(first, other, (CAMERA, second)), (), names=NAMES)
+    assert check is not None
+    return check
+
+
+@pytest.mark.parametrize("rows", [np.arange(80) + 0.5, np.arange(0, 80, 0.37)], ids=["crossings", "all points"])
+def test_two_cameras_that_agree_need_no_calibrated_projector(rows: FloatArray) -> None:
+    found = pair_check(SECOND, rows)
+    assert not found.is_refuted
+    assert found.pairs == 60 * 60
+    assert found.median_px < 0.1
+
+
+@pytest.mark.parametrize(
+    ("second", "is_mirrored", "words"),
+    [
+        (inverse_pose(SECOND), False, "the inverse pose (rotation and translation from camera 'right' to"),
+        (turned(SECOND, (1.0, 0, 0)), False, "camera 'right' has another pose relative to camera 'left'"),
+        (SECOND, True, "the picture of camera 'right' is mirrored left to right"),
+    ],
+)
+def test_two_cameras_refute_a_wrong_calibration_and_name_its_mistake(
+    second: Pinhole, *, is_mirrored: bool, words: str
+) -> None:
+    found = pair_check(second, np.arange(80) + 0.5, is_mirrored=is_mirrored)
+    assert found.is_refuted
+    assert words in found.cause
+    assert "projector" not in found.cause
