@@ -11,7 +11,17 @@ from pydantic import BaseModel, Field, model_validator
 
 from slrig.api.files import KnownTag, file_answers, kept_file, refuse_absent, require_whole
 from slrig.api.problems import problems
-from slrig.api.schemas import AskedPlan, JobBody, JobLinks, ListedJob, ShotRequest, filled, listed_links, scan_plan
+from slrig.api.schemas import (
+    AskedPlan,
+    JobBody,
+    JobLinks,
+    ListedJob,
+    NewName,
+    ShotRequest,
+    filled,
+    listed_links,
+    scan_plan,
+)
 from slrig.api.service import Cursor, IdempotencyKey, PageLength, Service, Serving, once, paged, started_once
 from slrig.bundle import MAX_VIEWS, AxisEntry, FreeText, PoseEntry, SafeText, Strict, orthonormalise_pose
 from slrig.calibrate.verification import require_healthy
@@ -159,6 +169,12 @@ def list_models(service: Serving, response: Response, cursor: Cursor = None, lim
 def look_at_model(service: Serving, model_id: UUID) -> ModelBody:
     """Return a model: its state, how far it is, and where its files are."""
     return model_body(service, service.store.get(model_id, JobKind.MODEL))
+
+
+@router.patch("/{model_id}", responses=problems(507))
+def rename_model(service: Serving, model_id: UUID, request: NewName) -> ModelBody:
+    """Give a model another name."""
+    return model_body(service, service.rename(model_id, JobKind.MODEL, request.label))
 
 
 @router.post("/{model_id}/cancel", status_code=202)

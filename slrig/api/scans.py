@@ -7,13 +7,14 @@ from dataclasses import replace
 from typing import Annotated, Any
 from uuid import UUID
 
-from fastapi import APIRouter, Body, Path, Response
+from fastapi import APIRouter, Body, Path, Query, Response
 from pydantic import BaseModel, Field
 
 from slrig.api.files import ready_files
 from slrig.api.problems import problems
 from slrig.api.schemas import (
     ListedScan,
+    NewName,
     PatternRequest,
     ScanBody,
     ScanPage,
@@ -25,9 +26,9 @@ from slrig.api.schemas import (
     scan_plan,
 )
 from slrig.api.service import Cursor, IdempotencyKey, PageLength, Service, Serving, paged, started_once
-from slrig.bundle import PresetDocument, PresetName, Strict
+from slrig.bundle import AwareMoment, PresetDocument, PresetName, SafeText, Strict
 from slrig.calibrate.verification import require_healthy
-from slrig.jobs.records import JobKind, JobRecord
+from slrig.jobs.records import JobKind, JobRecord, JobState
 from slrig.model import MAX_MASK_CHARACTERS
 from slrig.scan.exposure import proposed_exposures
 from slrig.scan.job import cancel_series as _cancel_series
@@ -63,20 +64,39 @@ def start_scan(
     return scan_body(record, {})
 
 
+class ScanQuery(BaseModel):
+    """Which scans a page is to have: of all that are on record, or of those that are as it says."""
+
+    name: Annotated[SafeText, Field(max_length=200)] | None = Field(
+        default=None, description="a part of the name, in whatever case, or the beginning of the id"
+    )
+    state: list[JobState] = Field(default=[], description="one of these; may be repeated")
+    since: AwareMoment | None = Field(default=None, description="created at this moment or later")
+    until: AwareMoment | None = Field(default=None, description="created before this moment")
+    rig: Annotated[SafeText, Field(max_length=200)] | None = Field(
+        default=None, description="name of the rig that scanned"
+    )
+    preset: Annotated[SafeText, Field(max_length=200)] | None = Field(
+        default=None, description="name of the preset that was asked for"
+    )
+    cursor: Cursor = None
+    limit: PageLength = 50
+
+
 @router.get("")
 def list_scans(
     service: Serving,
     response: Response,
-    cursor: Cursor = None,
-    limit: PageLength = 50,
+    asked: Annotated[ScanQuery, Query()],
 ) -> ScanPage:
-    """List scans from new to old."""
-    store = service.store
+    """List scans from new to old, all of them or those that are asked for."""
+    wanted = {name: value for name, value in asked if name not in {"cursor", "limit", "state"}}
 
     def found(most: int) -> Sequence[JobRecord]:
-        return store.page(JobKind.SCAN, before=cursor, limit=most)
+        return service.store.page(JobKind.SCAN, before=asked.cursor, limit=most, states=asked.state, **wanted)
 
-    shown, following = paged(found, limit, "/scan", service, response)
+    query = asked.model_dump(mode="json", exclude_unset=True, exclude={"cursor", "limit"})
+    shown, following = paged(found, asked.limit, "/scan", service, response, query)
     return ScanPage(scans=[_listed(service, record) for record in shown], next=following)
 
 
@@ -84,6 +104,12 @@ def list_scans(
 def look_at_scan(service: Serving, scan_id: UUID) -> ScanBody:
     """Return a scan: its state, how far it is, and where its files are."""
     return _body(service, service.store.get(scan_id, JobKind.SCAN))
+
+
+@router.patch("/{scan_id}", responses=problems(507))
+def rename_scan(service: Serving, scan_id: UUID, request: NewName) -> ScanBody:
+    """Give a scan another name."""
+    return _body(service, service.rename(scan_id, JobKind.SCAN, request.label))
 
 
 @router.post("/{scan_id}/cancel", status_code=202)
@@ -141,6 +167,7 @@ def _listed(service: Service, record: JobRecord) -> ListedScan:
         triangles=(mesh.get("figures") or {}).get("triangles"),
         sigma_mm=(mesh.get("sigma_mm") or {}).get("p50"),
         turn_deg=record.plan.get("turn_deg"),
+        preset=(record.plan.get("preset") or {}).get("name"),
         links=listed_links(record, service.folder.scan(record.id), "preview.png"),
     )
 

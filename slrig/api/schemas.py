@@ -260,6 +260,12 @@ def _chosen(plan: type[Any], request: BaseModel, defaults: ScanDefaults) -> dict
     return chosen
 
 
+class NewName(Strict):
+    """The name of a scan or a model from now on."""
+
+    label: FreeText | None = Field(description="free text; null takes the name away")
+
+
 class ProgressBody(BaseModel):
     """How far a job is: 0 to 1 of the whole."""
 
@@ -357,6 +363,7 @@ class ListedScan(ListedJob):
     """A scan in a list."""
 
     turn_deg: float | None = Field(description="angle of the turntable; null where nothing was turned")
+    preset: str | None = Field(description="the name of the preset that was asked for; null without one")
 
 
 class ScanSeries(BaseModel):

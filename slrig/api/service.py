@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, TypeVar
+from urllib.parse import urlencode
 from uuid import UUID
 
 import structlog
@@ -60,7 +61,7 @@ _JOB_S = (1.0, 2.5, 5.0, 10.0, 20.0, 40.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 36
 _STAGE_S = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
 """From writing a small picture to the optimisation of a large mesh, or a wait in line."""
 
-_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "DELETE"})
+_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE"})
 _OTHER = "other"
 
 
@@ -268,6 +269,12 @@ class Service:
         self.store.get(scan_id, JobKind.SCAN)
         self.manager.delete(scan_id, self.models.unused(scan_id))
 
+    def rename(self, job_id: UUID, kind: JobKind, label: str | None) -> JobRecord:
+        """Give a job another label, on record and beside its files. Raises JobNotFoundError, StorageError."""
+        place = self.manager.kinds[kind].place_of(self.store.get(job_id, kind), self.folder)
+        keep = partial(self.folder.relabel, job_id, place, label)
+        return self.store.rename(job_id, kind, label=label, keep=keep)
+
     def _copier(self) -> Copier | None:
         """What tells the catalogue of this rig, if the settings name one. Raises ConfigError, ExtraMissingError."""
         catalogue, copies = catalogue_of(self.settings), self.store.outbox.copies
@@ -380,17 +387,25 @@ Shown = TypeVar("Shown", JobRecord, ScheduledRun, AuditEntry)
 
 
 def paged(
-    found: Callable[[int], Sequence[Shown]], limit: int, path: str, service: Service, response: Response
+    found: Callable[[int], Sequence[Shown]],
+    limit: int,
+    path: str,
+    service: Service,
+    response: Response,
+    query: Mapping[str, Any] | None = None,
 ) -> tuple[Sequence[Shown], str | None]:
     """The records of a page, and the path of the page after it, which the header `Link` names, too.
 
     found : gives so many records, from new to old. limit : the most that is asked for; the settings may allow less.
+    query : what else was asked for, which the next page is to be of, too.
     """
     limit = min(limit, service.settings.page_limit)
     records = found(limit + 1)
     if len(records) <= limit:
         return records, None
-    following = f"{path}?cursor={records[limit - 1].number}&limit={limit}"
+    following = (
+        f"{path}?{urlencode({'cursor': records[limit - 1].number, 'limit': limit, **(query or {})}, doseq=True)}"
+    )
     response.headers["Link"] = f'<{following}>; rel="next"'
     return records[:limit], following
 

@@ -60,9 +60,29 @@ class Scans(Resource):
         options = given(budget_s=budget_s, preset=preset, patterns=patterns, coloured_light=coloured_light)
         return self._connection.json("POST", "/exposure", json=options)
 
-    def list(self, *, cursor: int | None = None, limit: int | None = None) -> Json:
-        """A page of scans from new to old: `scans`, and `next`, the path of the page after it."""
-        return self._connection.json("GET", "/scan", params=given(cursor=cursor, limit=limit))
+    def list(
+        self,
+        *,
+        name: str | None = None,
+        state: str | Sequence[str] | None = None,
+        since: str | None = None,
+        until: str | None = None,
+        rig: str | None = None,
+        preset: str | None = None,
+        cursor: int | None = None,
+        limit: int | None = None,
+    ) -> Json:
+        """A page of scans from new to old: `scans`, and `next`, the path of the page after it.
+
+        name : a part of the name, in whatever case, or the beginning of the id. state : one of these. since, until :
+        when they were created, ISO 8601 with the offset from UTC; the latter is excluded. rig, preset : by their names.
+        """
+        asked = given(name=name, state=state, since=since, until=until, rig=rig, preset=preset)
+        return self._connection.json("GET", "/scan", params={**asked, **given(cursor=cursor, limit=limit)})
+
+    def rename(self, scan_id: str, label: str | None) -> Json:
+        """Give a scan another name; None takes it away."""
+        return self._connection.json("PATCH", path("/scan/{}", scan_id), json={"label": label})
 
     def get(self, scan_id: str) -> Json:
         """A scan: its state, its progress, and the links of its files."""
@@ -182,6 +202,10 @@ class Models(Resource):
     def get(self, model_id: str) -> Json:
         """A model: its state, its progress, and the links of its files."""
         return self._connection.json("GET", path("/model/{}", model_id))
+
+    def rename(self, model_id: str, label: str | None) -> Json:
+        """Give a model another name; None takes it away."""
+        return self._connection.json("PATCH", path("/model/{}", model_id), json={"label": label})
 
     def delete(self, model_id: str) -> None:
         """Delete a finished model with all its files."""

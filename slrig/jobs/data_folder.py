@@ -3,7 +3,8 @@
 DATA/lock            locked by the one process that owns the folder, as long as it lives; empty
 DATA/holder          that process's id, and that of the last one where none lives
 DATA/slrig.sqlite    the records
-DATA/scans/ID/       a finished scan: bundle/, mesh.ply, report.json ..., and files.json with the digests of all
+DATA/scans/ID/       a finished scan: bundle/, mesh.ply, report.json ..., and files.json with the digests of all;
+                     label.json where it was renamed
 DATA/calibrations/   calibrations and their sessions: see `slrig.calibrate.store`
 DATA/acceptance/     acceptance tests: see `slrig.accept.store`
 DATA/models/         models of several scans: see `slrig.model_jobs.job`
@@ -35,7 +36,7 @@ from pydantic import TypeAdapter, ValidationError
 from slrig.bundle import sync_folder, sync_tree, write_file
 from slrig.errors import DamagedError, DataFolderGoneError, StorageError
 from slrig.failure import disk_errors
-from slrig.jobs.records import read_record
+from slrig.jobs.records import LABEL, read_record, write_label
 
 DATABASE, SCANS, ORPHANS, BUNDLE = "slrig.sqlite", "scans", ".orphans", "bundle"
 
@@ -68,7 +69,8 @@ def write_entries(folder: Path) -> None:
     """Write `FILES`: the digests of all files of a folder. Raises StorageError."""
     found = {}
     for path in sorted(folder.rglob("*")):
-        if path.is_file() and not path.is_symlink() and path != folder / FILES:
+        # A label may change: it is no part of what was committed.
+        if path.is_file() and not path.is_symlink() and path not in {folder / FILES, folder / LABEL}:
             found[path.relative_to(folder).as_posix()] = file_entry(path)
     write_file(folder / FILES, _entries_adapter.dump_json(found))
 
@@ -378,6 +380,17 @@ class DataFolder:
         with self._noting, disk_errors(place):
             made = {**_read_made(place), name: file_entry(place / name)}
             write_file(place / MADE, _entries_adapter.dump_json(made))
+
+    def relabel(self, job_id: UUID, place: Path | None, label: str | None) -> None:
+        """Keep the new label of a job with its files, where they are or where they are made. Raises StorageError."""
+        # In the order in which `put` moves them.
+        for folder in (self.staging(job_id), place):
+            if folder is not None and folder.is_dir():
+                try:
+                    write_label(folder, label)
+                except StorageError:
+                    if folder.is_dir():
+                        raise
 
     def has_made(self, place: Path, name: str) -> bool:
         """Whether a file that was made on request is there, as it was made; read once, until it changes."""

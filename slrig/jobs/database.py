@@ -500,6 +500,8 @@ def _set_up(connection: DBAPIConnection, _record: object) -> None:
     # The driver begins no transactions of its own: `_begin` does.
     connection.isolation_level = None
     connection.text_factory = _text
+    # SQLite's own knows the case of ASCII alone.
+    connection.create_function("casefold", 1, lambda text: text and text.casefold(), deterministic=True)
     cursor = connection.cursor()
     for pragma in (f"busy_timeout={int(1000 * PATIENCE_S)}", "synchronous=FULL", "foreign_keys=ON"):
         cursor.execute(f"PRAGMA {pragma}")

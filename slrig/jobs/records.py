@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from itertools import pairwise
@@ -21,6 +21,9 @@ from slrig.failure import JobFailure
 
 RECORD = "record.json"
 """The file beside those of a finished job that has its record."""
+
+LABEL = "label.json"
+"""The file beside the record that has the label which the job was given since: a JSON string, or null."""
 
 Clock = Callable[[], datetime]
 """Gives the present moment with a time zone."""
@@ -182,6 +185,7 @@ class JobRecord:
 
 
 _record_adapter = TypeAdapter(JobRecord)
+_label_adapter = TypeAdapter[str | None](str | None)
 
 
 def write_record(folder: Path, record: JobRecord) -> None:
@@ -192,9 +196,18 @@ def write_record(folder: Path, record: JobRecord) -> None:
 def read_record(folder: Path) -> JobRecord | None:
     """The record in the folder of a finished job; None where there is none that can be read."""
     try:
-        return _record_adapter.validate_json((folder / RECORD).read_bytes())
+        record = _record_adapter.validate_json((folder / RECORD).read_bytes())
     except (OSError, ValidationError):
         return None
+    try:
+        return replace(record, label=_label_adapter.validate_json((folder / LABEL).read_bytes()))
+    except (OSError, ValidationError):
+        return record
+
+
+def write_label(folder: Path, label: str | None) -> None:
+    """Write the new label of a job into its folder. Raises StorageError."""
+    write_file(folder / LABEL, _label_adapter.dump_json(label))
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,13 +7,13 @@ import threading
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from itertools import islice
 from typing import Any
 from uuid import UUID, uuid4
 
 import structlog
-from sqlalchemy import ColumnElement, Select, delete, event, func, select, text
+from sqlalchemy import ColumnElement, Select, case, delete, event, func, or_, select, text
 from sqlalchemy.orm import Session
 
 from slrig.config import NoticeKind
@@ -334,11 +334,41 @@ class JobStore:
         with self.database.reading() as session:
             return record_of(self._find(session, job_id, *kinds))
 
-    def page(self, *kinds: JobKind, before: int | None, limit: int) -> Sequence[JobRecord]:
-        """Return up to `limit` jobs, newest first, whose number is below `before`."""
+    def page(
+        self,
+        *kinds: JobKind,
+        before: int | None,
+        limit: int,
+        name: str | None = None,
+        states: Collection[JobState] = (),
+        since: datetime | None = None,
+        until: datetime | None = None,
+        rig: str | None = None,
+        preset: str | None = None,
+    ) -> Sequence[JobRecord]:
+        """Return up to `limit` jobs, newest first, whose number is below `before`, of those that are asked for.
+
+        name : a part of the label, in whatever case, or the beginning of the id. since, until : when they were created,
+        the latter excluded. rig, preset : by their names.
+        """
         query = _jobs(*kinds).order_by(JobRow.number.desc()).limit(limit)
         if before is not None:
             query = query.where(JobRow.number < before)
+        if name is not None:
+            part = func.casefold(JobRow.label).contains(name.casefold(), autoescape=True)
+            query = query.where(or_(part, JobRow.id.startswith(name.lower(), autoescape=True)))
+        if states:
+            query = query.where(JobRow.state.in_(states))
+        if since is not None:
+            query = query.where(JobRow.created_at >= stamp(since.astimezone(UTC)))
+        if until is not None:
+            query = query.where(JobRow.created_at < stamp(until.astimezone(UTC)))
+        if rig is not None:
+            query = query.where(JobRow.rig == rig)
+        if preset is not None:
+            # A plan that is damaged is no JSON.
+            found = case((func.json_valid(JobRow.plan), func.json_extract(JobRow.plan, "$.preset.name")))
+            query = query.where(found == preset)
         with self.database.reading() as session:
             return [record_of(row) for row in session.scalars(query)]
 
@@ -400,6 +430,23 @@ class JobStore:
             row = self._find(session, job_id, *kinds)
             row.pinned = pinned
             return record_of(row)
+
+    def rename(
+        self, job_id: UUID, *kinds: JobKind, label: str | None, keep: Callable[[], None] = lambda: None
+    ) -> JobRecord:
+        """Give a job another label, or none. keep : has its files say so; what that raises leaves the label as it was.
+
+        Raises JobNotFoundError.
+        """
+        with self.database.changing() as session:
+            row = self._find(session, job_id, *kinds)
+            row.label = label
+            record = record_of(row)
+            if record.state.final:
+                self.outbox.closed(session, record)
+            keep()
+        self._wake(job_id, row.parent)
+        return record
 
     def states(self, *kinds: JobKind) -> dict[UUID, JobState]:
         """Return the state of every job on record."""

@@ -9,6 +9,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from slrig.errors import RegistrationRefusedError
+from slrig.jobs.records import read_record
 from slrig.model_jobs.plan import MEDIA_TYPES, GivenPoses, MarkerPoses, StatedAxis, TurntablePoses, UnknownPoses
 from tests.unit.api.conftest import ServedBench, ended, refusal
 from tests.unit.model_jobs.model_bench import kept_scan, until_told
@@ -73,6 +74,10 @@ def test_model_is_made_once_followed_and_fetched(client: TestClient, served: Ser
     assert marked["plan"]["poses"] == {"kind": "markers", "dictionary": "DICT_4X4_50"}
     assert client.delete(marked["links"]["self"]).status_code == 204
     assert client.delete(unknown["links"]["self"]).status_code == 204
+    assert client.patch(model["links"]["self"], json={"label": "mug"}).json()["label"] == "mug"
+    kept = read_record(served.service.models.place(UUID(model["id"])))
+    assert kept is not None
+    assert kept.label == "mug"
     page = client.get("/model", params={"limit": 1}).json()
     assert [each["id"] for each in page["models"]] == [second["id"]]
     assert [each["id"] for each in client.get(page["next"]).json()["models"]] == [model["id"]]

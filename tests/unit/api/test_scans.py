@@ -31,8 +31,8 @@ from slrig.bundle.writing import BundleWriter
 from slrig.devices import Rig
 from slrig.errors import WorkerLostError
 from slrig.jobs import data_folder
-from slrig.jobs.data_folder import DataFolder, write_entries
-from slrig.jobs.records import JobState, acting_as
+from slrig.jobs.data_folder import DataFolder, damaged_files, write_entries
+from slrig.jobs.records import JobState, acting_as, read_record
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Task
 from slrig.model import Calibration, CameraFormat, Pinhole, Shot, Size, White
@@ -126,6 +126,38 @@ def test_key_in_flight_is_refused_for_a_moment(client: TestClient, served: Serve
     assert refused.headers["Retry-After"] == "1"
     served.service.keys.release_all()
     assert client.post("/scan", headers={"Idempotency-Key": "slow"}).status_code == 202
+
+
+def test_a_scan_is_renamed_beside_its_files_too_and_found_by_its_name(client: TestClient, served: ServedBench) -> None:
+    scan = client.post("/scan", json={"label": "cup"}).json()
+    here, folder = scan["links"]["self"], served.service.folder
+    ended(client, scan["id"])
+    renamed = client.patch(here, json={"label": "Tasse 7"})
+    assert (renamed.status_code, renamed.json()["label"]) == (200, "Tasse 7")
+    kept = read_record(place_of(served, scan["id"]))
+    assert kept is not None
+    assert kept.label == "Tasse 7"
+    client.post(f"{here}/reconstruct")
+    # While it is computed once more, also what comes of that has the new name.
+    client.patch(here, json={"label": "Tasse 8"})
+    assert ended(client, scan["id"])["label"] == "Tasse 8"
+    remade = read_record(place_of(served, scan["id"]))
+    assert remade is not None
+    assert (remade.label, damaged_files(folder.scan(remade.id), digests=True)) == ("Tasse 8", {})
+    found = client.get("/scan", params={"name": "tasse", "state": ["succeeded", "failed"], "limit": 1})
+    assert [each["id"] for each in found.json()["scans"]] == [scan["id"]]
+    assert found.json()["next"] is None
+    finished(client)
+    paged = client.get("/scan", params={"state": "succeeded", "since": "2026-01-01T00:00:00+01:00", "limit": 1}).json()
+    assert "&state=succeeded&since=2026-01-01T00%3A00%3A00%2B01%3A00" in paged["next"]
+    assert [each["id"] for each in client.get(paged["next"]).json()["scans"]] == [scan["id"]]
+    audited = client.get("/audit").json()["entries"]
+    assert [(each["path"], each["status"]) for each in audited if each["method"] == "PATCH"] == [(here, 200)] * 2
+    assert client.patch(here, json={"label": None}).json()["label"] is None
+    for body in ({}, {"label": ""}, {"label": "a\nb"}, {"label": "x", "pinned": True}):
+        assert client.patch(here, json=body).status_code == 422, body
+    assert refusal(client, "PATCH", f"/scan/{uuid4()}", json={"label": "x"}) == (404, "/problems/job-not-found")
+    assert client.get("/scan", params={"since": "2026-01-01"}).status_code == 422
 
 
 def test_busy_rig_names_its_holder_and_the_queue_is_short(client: TestClient, served: ServedBench) -> None:

@@ -371,6 +371,12 @@ def test_start_puts_finished_scans_on_record_again_beside_a_database_that_was_lo
     for record in records:
         finished(folder, record)
         store.delete(record.id)
+    # Renamed since, also to have no name; that is no damage.
+    for record, label in ((records[0], "part 0, turned"), (records[2], None)):
+        folder.relabel(record.id, folder.scan(record.id), "in between")
+        write_entries(folder.scan(record.id))
+        folder.relabel(record.id, folder.scan(record.id), label)
+        assert damaged_files(folder.scan(record.id), digests=True) == {}
     (folder.scan(records[1].id) / "mesh.ply").unlink()
     assert settled(store, folder) == {
         "recovered": {str(record.id) for record in records}, "damaged": {str(records[1].id)},
@@ -379,7 +385,8 @@ def test_start_puts_finished_scans_on_record_again_beside_a_database_that_was_lo
     assert (newest.id, damaged.id, oldest.id) == tuple(record.id for record in records)
     assert damaged.fault is not None
     assert damaged.fault.code == "damaged"
-    assert (newest.state, newest.label, newest.created_at) == (JobState.SUCCEEDED, "part 0", made)
+    assert (newest.state, newest.created_at) == (JobState.SUCCEEDED, made)
+    assert [record.label for record in (newest, damaged, oldest)] == ["part 0, turned", "part 1", None]
     assert plan_from_json(newest.plan) == plan
     assert newest.summary == SUMMARY
     assert [event.kind for event in store.events(newest.id, after=0)] == ["state"]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator
+from datetime import datetime, timedelta, timezone
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 import pytest
@@ -21,10 +23,15 @@ from slrig.jobs.job import ProgressRecorder
 from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, Stage, stages_of
 from slrig.jobs.store import KEPT_PROGRESS, JobStore, RequestKeys
 from slrig.scan.job import plan_from_json, plan_json
-from slrig.scan.plan import PatternPlan, ScanPlan
+from slrig.scan.plan import PatternPlan, PresetUse, ScanPlan
 from tests.unit.scan.fakes import SetClock
 
 NOON = SetClock().now
+
+
+def hours_on(hours: int) -> datetime:
+    """A moment after noon, by the clocks of another place."""
+    return (NOON + timedelta(hours=hours)).astimezone(timezone(timedelta(hours=-5)))
 
 
 @pytest.fixture
@@ -92,6 +99,39 @@ def test_pages_run_from_new_to_old_without_overlap(store: JobStore) -> None:
     first = store.page(before=None, limit=3)
     second = store.page(before=first[-1].number, limit=3)
     assert [scan.id for scan in (*first, *second)] == [scan.id for scan in reversed(made)]
+
+
+def asked(preset: str) -> dict[str, object]:
+    return plan_json(ScanPlan(preset=PresetUse(preset, 1, "0" * 64)))
+
+
+@pytest.mark.parametrize(
+    ("wanted", "found"),
+    [
+        ({"name": "GRÖSSE_"}, [1]), ({"name": "0"}, [2, 1, 0]), ({"name": "%"}, []), ({"name": "ID"}, [2]),
+        ({"states": [JobState.FAILED, JobState.CAPTURING]}, [2, 0]), ({"rig": "hall"}, [3]), ({"preset": "shiny"}, [1]),
+        ({"since": hours_on(1), "until": hours_on(3)}, [2, 1]), ({"name": "0", "preset": "dark", "until": NOON}, []),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_pages_have_what_is_asked_for(
+    store: JobStore, clock: SetClock, wanted: dict[str, Any], found: list[int]
+) -> None:
+    ids = []
+    labels = ["plate-007", "Größe_10", "plate-008", None]
+    for label, plan, rig in zip(labels, [{}, asked("shiny"), asked("dark"), {}], [*["bench"] * 3, "hall"], strict=True):
+        ids.append(store.create(plan, kind=JobKind.SCAN, rig=rig, label=label).id)
+        clock.move(seconds=3600)
+    store.advance(ids[0], JobState.CAPTURING)
+    store.finish(ids[2], JobState.FAILED)
+    # A plan that is damaged is of no preset.
+    store.database.close()
+    with sqlite3.connect(store.database.path) as file:
+        file.execute("UPDATE job SET plan = '{' WHERE id = ?", (str(ids[3]),))
+    if wanted.get("name") == "ID":
+        wanted = {"name": str(ids[2])[:8].upper()}
+    page = store.page(JobKind.SCAN, before=None, limit=10, **wanted)
+    assert [ids.index(record.id) for record in page] == found
 
 
 def test_numbers_are_never_given_twice(store: JobStore) -> None:
