@@ -116,6 +116,8 @@ def bare_app() -> FastAPI:
         dependencies=[Depends(turn, scope="function")],
     )
     for part in (
+        # Before what would take its name for an id.
+        files.together_router,
         scans.router,
         events.router,
         files.router,

@@ -1,19 +1,24 @@
-"""The files of a scan: mesh, points, report, pictures, clouds made on request, and the bundle as one zip."""
+"""The files of a scan: mesh, points, report, pictures, clouds made on request, and the bundle, or a file of several
+scans, as one zip.
+"""
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 import zipfile
 from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
+from urllib.parse import quote
 from uuid import UUID
 
 import structlog
-from fastapi import APIRouter, Header, Response
+from fastapi import APIRouter, Header, Query, Response
 from fastapi import Path as PathParameter
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, StreamingResponse
@@ -39,6 +44,8 @@ from slrig.scan.formats import (
     BUNDLE_ZIP,
     CALIBRATION_USED,
     MEDIA_TYPES,
+    PREVIEW,
+    THUMBNAIL,
     agreement_picture,
     causes_picture,
     missing_for,
@@ -46,6 +53,7 @@ from slrig.scan.formats import (
     requested_forms,
 )
 from slrig.scan.job import cloud_bytes
+from slrig.scan.thumbnail import encode_thumbnail
 
 # A cloud takes the worker half a second and some hundred megabytes: one at a time, whoever asks.
 _making = threading.Lock()
@@ -210,11 +218,10 @@ def _file(
         require_whole(service, record, place, MESH if name in ON_REQUEST else name)
     if made is None and not (record.state.final and service.folder.owns(path)):
         refuse_absent(record, path.name)
-    headers = _headers(scan_id, name, None if made is not None else place)
+    headers = _headers(record, name, None if made is not None else place)
     if _still_known(known, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     if made is not None:
-        headers["Content-Disposition"] = f'inline; filename="{path.name}"'
         return Response(made, media_type=media_type, headers=headers)
     return _kept(path, media_type, headers)
 
@@ -230,9 +237,9 @@ def require_whole(service: Service, record: JobRecord, place: Path, *names: str)
         raise
 
 
-def kept_file(path: Path, media_type: str, job_id: UUID, known: str | None) -> Response:
+def kept_file(path: Path, media_type: str, record: JobRecord, known: str | None) -> Response:
     """A file that never changes, of a job that is over; 304 where the client knows it."""
-    headers = _headers(job_id, path.name, path.parent)
+    headers = _headers(record, path.name, path.parent)
     return (
         Response(status_code=304, headers=headers)
         if _still_known(known, headers["ETag"])
@@ -246,7 +253,7 @@ class _File(FileResponse):
 
 
 def _kept(path: Path, media_type: str, headers: dict[str, str]) -> Response:
-    return _File(path, media_type=media_type, filename=path.name, content_disposition_type="inline", headers=headers)
+    return _File(path, media_type=media_type, headers=headers)
 
 
 def _cloud(service: Service, scan_id: UUID, form: str, camera: str | None, known: str | None) -> Response:
@@ -256,7 +263,7 @@ def _cloud(service: Service, scan_id: UUID, form: str, camera: str | None, known
     record = _record(service, scan_id)
     if not record.state.final or not has_sources(service.folder, place, camera):
         refuse_absent(record, path.name)
-    headers = _headers(scan_id, path.name, place)
+    headers = _headers(record, path.name, place)
     if _still_known(known, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     if not service.folder.owns(path):
@@ -276,14 +283,41 @@ def _made_so_far(folder: DataFolder, record: JobRecord, name: str) -> bytes | No
     return None
 
 
-def _headers(job_id: UUID, name: str, place: Path | None) -> dict[str, str]:
+_SLUG_CHARACTERS = 80
+
+
+def saved_name(record: JobRecord, name: str) -> str:
+    """What a file of a scan or a model is called where it is saved: RIG-LABEL-FILE; without a label, by its time here.
+
+    Letters and digits of all scripts stay, all else becomes a hyphen: it is one name on every system.
+    """
+    begun = f"{record.created_at.astimezone():%Y-%m-%d-%H%M%S}"
+    return "-".join(filter(None, (_slug(record.rig), _slug(record.label or "") or begun, name.rpartition("/")[2])))
+
+
+def _slug(text: str) -> str:
+    return re.sub(r"[^\w.]+", "-", text).strip("-.")[:_SLUG_CHARACTERS]
+
+
+def disposition(called: str, kind: Literal["inline", "attachment"] = "inline") -> str:
+    """The header Content-Disposition (RFC 6266) of a file that is to be saved as `called`.
+
+    >>> disposition("rig-cup-mesh.ply"), disposition("rig-Größe-mesh.ply")
+    ('inline; filename="rig-cup-mesh.ply"', "inline; filename*=utf-8''rig-Gr%C3%B6%C3%9Fe-mesh.ply")
+    """
+    quoted = quote(called)
+    return f'{kind}; filename="{called}"' if quoted == called else f"{kind}; filename*=utf-8''{quoted}"
+
+
+def _headers(record: JobRecord, name: str, place: Path | None) -> dict[str, str]:
     # An id is never given twice, and a job's files change only where they are made once more.
     committed = None
     if place is not None:
         with suppress(OSError):
             committed = (place / FILES).stat().st_mtime_ns
-    tag = f"{job_id}/{name}" if committed is None else f"{job_id}/{name}/{committed:x}"
-    return {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache"}
+    tag = f"{record.id}/{name}" if committed is None else f"{record.id}/{name}/{committed:x}"
+    called = disposition(saved_name(record, name))
+    return {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Content-Disposition": called}
 
 
 def _still_known(known: str | None, tag: str) -> bool:
@@ -432,12 +466,78 @@ def _bundle(service: Service, scan_id: UUID, known: str | None) -> Response:
     recorded = [each for each in read_entries(bundle.parent) if each.startswith(f"{BUNDLE}/")]
     require_whole(service, record, bundle.parent, *recorded)
     headers = {
-        **_headers(scan_id, BUNDLE_ZIP, bundle.parent),
-        "Content-Disposition": f'attachment; filename="{scan_id}.zip"',
+        **_headers(record, BUNDLE_ZIP, bundle.parent),
+        "Content-Disposition": disposition(saved_name(record, BUNDLE_ZIP), "attachment"),
     }
     if _still_known(known, headers["ETag"]):
         return Response(status_code=304, headers=headers)
-    return StreamingResponse(zipped(bundle), media_type="application/zip", headers=headers)
+    # What a link leads to was not recorded here.
+    files = [path for path in sorted(bundle.rglob("*")) if path.is_file() and not path.is_symlink()]
+    named = [(path.relative_to(bundle).as_posix(), path) for path in files]
+    return StreamingResponse(zipped(named), media_type="application/zip", headers=headers)
+
+
+MOST_TOGETHER = 50
+"""Scans of which a file can be had in one zip."""
+
+together_router = APIRouter(prefix="/scan", tags=["files"])
+
+
+@together_router.get(
+    "/files.zip", response_class=Response, responses={**file_of("application/zip", 404, 409, 410, 503)}
+)
+async def fetch_together(
+    held: Held,
+    service: Serving,
+    scan: Annotated[list[UUID], Query(min_length=1, max_length=MOST_TOGETHER, description="ids of finished scans")],
+    file: Annotated[
+        Literal["mesh.ply", "mesh.glb", "mesh.stl", "mesh.obj", "mesh.3mf", "points.ply", "report.json", "preview.png"],
+        Query(description="which of each"),
+    ] = "mesh.ply",
+) -> Response:
+    """Return one file of each of several scans as a zip. Files that are made on request are made first; after 30 s the
+    answer is 503 with `Retry-After`, and the next request goes on from there.
+    """
+    held.enter_context(service.streams.take())
+    until_s = time.monotonic() + LONGEST_WAIT_S
+    named: dict[str, Path] = {}
+    for number, scan_id in enumerate(dict.fromkeys(scan)):
+        path = service.folder.scan(scan_id) / file
+        if file in ON_REQUEST and not await run_in_threadpool(service.folder.has_made, path.parent, file):
+            if time.monotonic() > until_s:
+                message = f"{number} of {len(scan)} files are made. Ask again for the others."
+                raise WorkerBusyError(message)
+            await service.makings.of((scan_id, file), partial(_convert, service, scan_id, file))
+        record = await run_in_threadpool(_whole_file, service, scan_id, file)
+        called = saved_name(record, file)
+        if called in named:
+            called = saved_name(replace(record, label=f"{record.label} {str(scan_id)[:8]}"), file)
+        named[called] = path
+    headers = {
+        "Content-Disposition": disposition(f"{_slug(record.rig)}-{len(named)}-scans-{file}.zip", "attachment"),
+        "Cache-Control": "no-store",
+    }
+    return StreamingResponse(zipped(named.items()), media_type="application/zip", headers=headers)
+
+
+def _whole_file(service: Service, scan_id: UUID, name: str) -> JobRecord:
+    """The record of a scan that is over, whose file is there, as it was made."""
+    record, place = _record(service, scan_id), service.folder.scan(scan_id)
+    if not record.state.final or not service.folder.owns(place / name):
+        refuse_absent(record, name)
+    require_whole(service, record, place, MESH if name in ON_REQUEST else name)
+    return record
+
+
+@router.get(f"/{THUMBNAIL}", response_class=Response, responses={**file_of("image/png", 409), **_UNCHANGED})
+def fetch_thumbnail(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
+    """Return a small picture of the mesh alone, for lists."""
+    record = _whole_file(service, scan_id, PREVIEW)
+    place = service.folder.scan(scan_id)
+    headers = _headers(record, THUMBNAIL, place)
+    if _still_known(known, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    return Response(encode_thumbnail(service.folder.read(place / PREVIEW)), media_type="image/png", headers=headers)
 
 
 class _Outlet(bytearray):
@@ -456,18 +556,15 @@ class _Outlet(bytearray):
         return taken
 
 
-def zipped(folder: Path) -> Iterator[bytes]:
-    """The files of a folder as the bytes of a zip, stored (frames are compressed already), a piece at a time.
+def zipped(named: Iterable[tuple[str, Path]]) -> Iterator[bytes]:
+    """Files by their names in it as the bytes of a zip, stored (frames are compressed already), a piece at a time.
 
-    The same files give the same bytes: names are sorted, and all times are the zip format's first.
+    The same files give the same bytes: all times are the zip format's first.
     """
     outlet = _Outlet()
     with zipfile.ZipFile(outlet, "w") as archive:  # type: ignore[call-overload] # write and flush are enough
-        for path in sorted(folder.rglob("*")):
-            # What a link leads to was not recorded here.
-            if path.is_symlink() or not path.is_file():
-                continue
-            entry = zipfile.ZipInfo(path.relative_to(folder).as_posix(), _ZIP_EPOCH)
+        for name, path in named:
+            entry = zipfile.ZipInfo(name, _ZIP_EPOCH)
             entry.external_attr = 0o644 << 16
             with path.open("rb") as source, archive.open(entry, "w", force_zip64=True) as member:
                 while piece := source.read(_CHUNK_BYTES):

@@ -209,7 +209,7 @@ def _serve(name: str, media_type: str) -> Callable[..., Response]:
             refuse_absent(record, name)
         service.retention.reading(model_id)
         require_whole(service, record, path.parent, name)
-        return kept_file(path, media_type, model_id, known)
+        return kept_file(path, media_type, record, known)
 
     fetch.__doc__ = f"Return {name} of a model that succeeded. ETags and ranges are honoured."
     return fetch
@@ -229,7 +229,7 @@ for _name, _media_type in MEDIA_TYPES.items():
 
 def _listed(service: Service, record: JobRecord) -> ListedModel:
     found = {name: (record.summary or {}).get(name) for name in ("views", "triangles", "sigma_mm")}
-    links = listed_links(record, service.models.place(record.id), SIDES)
+    links = listed_links(record, service.models.place(record.id) / SIDES, SIDES)
     return filled(ListedModel, record, error=record.fault, links=links, **found)
 
 

@@ -31,6 +31,7 @@ from slrig.calibrate.verification import require_healthy
 from slrig.jobs.records import JobKind, JobRecord, JobState
 from slrig.model import MAX_MASK_CHARACTERS
 from slrig.scan.exposure import proposed_exposures
+from slrig.scan.formats import PREVIEW, THUMBNAIL
 from slrig.scan.job import cancel_series as _cancel_series
 from slrig.scan.job import scans_of, series
 from slrig.scan.plan import PresetSource
@@ -168,7 +169,7 @@ def _listed(service: Service, record: JobRecord) -> ListedScan:
         sigma_mm=(mesh.get("sigma_mm") or {}).get("p50"),
         turn_deg=record.plan.get("turn_deg"),
         preset=(record.plan.get("preset") or {}).get("name"),
-        links=listed_links(record, service.folder.scan(record.id), "preview.png"),
+        links=listed_links(record, service.folder.scan(record.id) / PREVIEW, THUMBNAIL),
     )
 
 

@@ -372,10 +372,10 @@ class ScanSeries(BaseModel):
     scans: list[ScanBody]
 
 
-def listed_links(record: JobRecord, place: Path, picture: str) -> ListedLinks:
-    """The links of a scan or a model in a list. place : its folder. picture : the name of the one that it may have."""
+def listed_links(record: JobRecord, made: Path, picture: str) -> ListedLinks:
+    """The links of a scan or a model in a list. picture : the name of the one that it has where there is `made`."""
     here = f"{record.kind.path}/{record.id}"
-    shown = f"{here}/{picture}" if record.state.final and (place / picture).is_file() else None
+    shown = f"{here}/{picture}" if record.state.final and made.is_file() else None
     return ListedLinks(self=here, events=f"{here}/events", cancel=f"{here}/cancel", picture=shown)
 
 

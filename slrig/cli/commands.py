@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 import typer.core
 
-from slrig.cli import calibrate, schedule
+from slrig.cli import calibrate, scans, schedule
 from slrig.cli.model import model, turntable_app
 from slrig.cli.options import (
     AcceptanceOptions,
@@ -681,6 +681,7 @@ app.command()(restore)
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(schedule.app, name="schedule")
 app.add_typer(preset_app, name="preset")
+app.add_typer(scans.app, name="scans")
 app.add_typer(turntable_app, name="turntable")
 app.add_typer(key_app, name="key")
 app.add_typer(pool_app, name="pool")

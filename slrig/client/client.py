@@ -9,6 +9,7 @@ from base64 import b64encode
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from email.message import EmailMessage
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -484,6 +485,14 @@ class Client:
     def fetch(self, link: str, path: str | Path) -> None:
         """Write the file behind a link of an answer, whole or not at all."""
         self.connection.fetch(link, Path(path))
+
+    def save(self, link: str, folder: str | Path) -> Path:
+        """Write the file behind a link into a folder, by the name that the service gives it, and return its path."""
+        about = EmailMessage()
+        about["Content-Disposition"] = self.connection.send("HEAD", link).headers["Content-Disposition"]
+        target = Path(folder) / Path(about.get_filename(link)).name
+        self.connection.fetch(link, target)
+        return target
 
     def follow(self, link: str) -> Iterator[Event]:
         """The events of the job whose `events` link this is, until it is done."""

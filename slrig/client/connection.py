@@ -250,7 +250,7 @@ class Connection:
         """The answer to a request. A service that says when to ask again, because it has no time to make a file now, is
         asked again for some minutes.
         """
-        tries = _BUSY_TRIES if request.method == "GET" else 1
+        tries = _BUSY_TRIES if request.method in {"GET", "HEAD"} else 1
         while True:
             tries -= 1
             response = self.http.send(request, stream=stream)

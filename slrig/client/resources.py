@@ -80,6 +80,10 @@ class Scans(Resource):
         asked = given(name=name, state=state, since=since, until=until, rig=rig, preset=preset)
         return self._connection.json("GET", "/scan", params={**asked, **given(cursor=cursor, limit=limit)})
 
+    def files(self, scan_ids: Sequence[str], file: str | None = None) -> bytes:
+        """A zip of one file of each of several scans, 50 at most. file : its name; "mesh.ply" by default."""
+        return self._connection.send("GET", "/scan/files.zip", params=given(scan=scan_ids, file=file)).content
+
     def rename(self, scan_id: str, label: str | None) -> Json:
         """Give a scan another name; None takes it away."""
         return self._connection.json("PATCH", path("/scan/{}", scan_id), json={"label": label})

@@ -374,6 +374,10 @@ def _model(mesh: Mesh) -> Iterator[str]:
     yield '</triangles>\n</mesh>\n</object>\n</resources>\n<build><item objectid="2"/></build>\n</model>\n'
 
 
+PREVIEW = "preview.png"
+THUMBNAIL = "thumbnail.png"
+"""The mesh of the preview alone, small, for lists."""
+
 MEDIA_TYPES: Mapping[str, str] = {
     "mesh.ply": "application/octet-stream",
     "mesh.glb": "model/gltf-binary",
@@ -384,7 +388,7 @@ MEDIA_TYPES: Mapping[str, str] = {
     "coarse.glb": "model/gltf-binary",
     "points.ply": "application/octet-stream",
     "report.json": "application/json",
-    "preview.png": "image/png",
+    PREVIEW: "image/png",
 }
 """Those that every scan that succeeded has."""
 

@@ -43,6 +43,7 @@ from slrig.reconstruction import (
     project,
 )
 from slrig.scan.stream import CameraResult
+from slrig.scan.thumbnail import BACKDROP, CAPTION_PX, GAP_PX
 
 _AT_ONCE = 65_536  # vertices: what is float64 in between stays below 4 MB
 
@@ -73,7 +74,6 @@ Picture = NDArray[np.uint8]
 
 _SUPERSAMPLING = 2
 _ROWS_AT_LEAST = 64  # in a band, a fifth of a millisecond
-_BACKDROP = (74, 67, 63)
 _COLOURS = np.array(((196, 209, 219), (92, 92, 176)), dtype=np.float64)  # of the front and of the back
 _DARK, _HEADLIGHT, _SIDE_LIGHT = 0.12, 0.46, 0.44  # of the colour: everywhere, and from each light at most
 _TO_VIEWER = np.array((0.0, 0.0, -1.0), dtype=np.float64)
@@ -91,7 +91,7 @@ def shaded(mesh: Mesh, camera: Pinhole) -> Picture:
     to_side = _TO_SIDE_LIGHT * (math.copysign(1.0, leaning), 1.0, 1.0) / np.linalg.norm(_TO_SIDE_LIGHT)
     # Normals are in the world: rather than each of them, the lights are turned.
     lights = np.stack((_HEADLIGHT * _TO_VIEWER, _SIDE_LIGHT * to_side)) @ camera.rotation
-    picture = np.full((*view.face.shape, 3), _BACKDROP, dtype=np.uint8)
+    picture = np.full((*view.face.shape, 3), BACKDROP, dtype=np.uint8)
     in_bands(_lit, len(picture), view.face, normals, front, lights, _COLOURS, picture, rows_at_least=_ROWS_AT_LEAST)
     return np.asarray(resized(picture, camera.size), dtype=np.uint8)
 
@@ -125,8 +125,6 @@ def _lit(first: int, last: int, face: Any, normals: Any, front: Any, lights: Any
 
 _PANEL_PX = 520
 _PANEL_HEIGHT_PX = 640
-_GAP_PX = 10
-_CAPTION_PX = 34
 _TURN_DEG = 35.0
 _FILL = 0.86
 _SHOWN_PERCENTS = (0.2, 99.8)
@@ -373,7 +371,7 @@ def _turned_to_show(sample: _Sample, middle_mm: FloatArray, camera: Pinhole, siz
 def captioned(panel: Picture, title: str, detail: str) -> Picture:
     """The panel with a line of text under it: what it shows on the left, a figure on the right."""
     rows, columns = panel.shape[:2]
-    page = np.full((rows + _CAPTION_PX, columns, 3), _PAGE, dtype=np.uint8)
+    page = np.full((rows + CAPTION_PX, columns, 3), _PAGE, dtype=np.uint8)
     page[:rows] = panel
     _text(page, title, (4, rows + 23))
     _text(page, detail, (columns - _text_width(detail) - 4, rows + 23))
@@ -410,12 +408,12 @@ def _draw_legend(page: Picture, left: int, counts: NDArray[np.int64]) -> None:
 def side_by_side(panels: list[Picture]) -> Picture:
     """One row of panels, with gaps beside and above them."""
     rows = max(panel.shape[0] for panel in panels)
-    columns = sum(panel.shape[1] for panel in panels) + _GAP_PX * (len(panels) + 1)
-    page = np.full((rows + _GAP_PX, columns, 3), _PAGE, dtype=np.uint8)
-    left = _GAP_PX
+    columns = sum(panel.shape[1] for panel in panels) + GAP_PX * (len(panels) + 1)
+    page = np.full((rows + GAP_PX, columns, 3), _PAGE, dtype=np.uint8)
+    left = GAP_PX
     for panel in panels:
-        page[_GAP_PX : _GAP_PX + panel.shape[0], left : left + panel.shape[1]] = panel
-        left += panel.shape[1] + _GAP_PX
+        page[GAP_PX : GAP_PX + panel.shape[0], left : left + panel.shape[1]] = panel
+        left += panel.shape[1] + GAP_PX
     return page
 
 

@@ -115,7 +115,7 @@ def test_shell_completes_commands() -> None:
     found = subprocess.run(
         [sys.executable, "-m", "slrig.cli"], capture_output=True, text=True, check=False, env={**os.environ, **words}
     )
-    assert found.stdout.split() == ["scan", "schedule"]
+    assert found.stdout.split() == ["scan", "schedule", "scans"]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in Linux's /proc")

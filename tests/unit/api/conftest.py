@@ -114,8 +114,8 @@ def commands(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     def forward(request: httpx2.Request) -> httpx2.Response:
         path, headers = request.url.raw_path.decode(), dict(request.headers)
         answer = client.request(request.method, path, content=request.read(), headers=headers)
-        kind = {"content-type": answer.headers.get("content-type", "")}
-        return httpx2.Response(answer.status_code, content=answer.content, headers=kind)
+        told = {each: answer.headers.get(each, "") for each in ("content-type", "content-disposition")}
+        return httpx2.Response(answer.status_code, content=answer.content, headers=told)
 
     def reaching(_service: ServiceOptions) -> Client:
         return Client("http://127.0.0.1:1", KEY, transport=httpx2.MockTransport(forward))

@@ -43,6 +43,7 @@ from tests.ros_readers import library
 from tests.unit.api.conftest import KEY, ServedBench, client_of, ended, refusal
 from tests.unit.calibrate.calibration_bench import BOARD
 from tests.unit.capture.fake_rig import CameraFaults, fake_rig
+from tests.unit.command import done, refused, slrig
 from tests.unit.jobs.tame_compute import TameCompute
 from tests.unit.scan import fake_pipeline
 from tests.unit.scan.fakes import WAIT_S
@@ -336,6 +337,82 @@ def test_what_cannot_be_reconstructed_again_says_why(client: TestClient, served:
     assert refusal(client, "POST", f"/scan/{uuid4()}/reconstruct")[0] == 404
 
 
+def test_files_are_saved_by_the_name_of_their_scan(client: TestClient, served: ServedBench) -> None:
+    scan = finished(client)
+    here = scan["links"]["self"]
+    begun = f"{datetime.fromisoformat(scan['created_at']).astimezone():%Y-%m-%d-%H%M%S}"
+    (place_of(served, scan["id"]) / "causes-left.png").touch()
+
+    def saved(name: str) -> str:
+        return str(client.head(f"{here}/{name}").headers["content-disposition"])
+
+    for name in ("mesh.ply", "mesh.stl", "report.json", "causes-left.png", "thumbnail.png"):
+        assert saved(name) == f'inline; filename="bench-{begun}-{name}"'
+    for label, stem in (("plate 007", "plate-007"), ("../../.ssh/a:b", "ssh-a-b"), ("***", begun)):
+        client.patch(here, json={"label": label})
+        assert saved("mesh.stl") == f'inline; filename="bench-{stem}-mesh.stl"'
+        assert saved("bundle.zip") == f'attachment; filename="bench-{stem}-bundle.zip"'
+    client.patch(here, json={"label": "Größe"})
+    assert saved("mesh.ply") == "inline; filename*=utf-8''bench-Gr%C3%B6%C3%9Fe-mesh.ply"
+    tag = client.head(f"{here}/mesh.ply").headers["etag"]
+    known = client.get(f"{here}/mesh.ply", headers={"If-None-Match": tag})
+    assert (known.status_code, "Gr%C3%B6%C3%9Fe" in known.headers["content-disposition"]) == (304, True)
+
+
+def test_a_file_of_several_scans_comes_as_one_zip(
+    client: TestClient, served: ServedBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second, third = (finished(client) for _ in range(3))
+    for scan, label in ((first, "cup"), (second, "cup"), (third, "plate")):
+        client.patch(scan["links"]["self"], json={"label": label})
+    asked: dict[str, Any] = {"scan": [each["id"] for each in (first, second, third, first)], "file": "mesh.stl"}
+    with monkeypatch.context() as patched:
+        patched.setattr(clouds, "LONGEST_WAIT_S", -1.0)
+        later = client.get("/scan/files.zip", params=asked)
+        assert (later.status_code, later.headers["Retry-After"]) == (503, "5")
+    answer = client.get("/scan/files.zip", params=asked)
+    assert answer.headers["content-disposition"] == 'attachment; filename="bench-3-scans-mesh.stl.zip"'
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        names = ["bench-cup-mesh.stl", f"bench-cup-{second['id'][:8]}-mesh.stl", "bench-plate-mesh.stl"]
+        assert archive.namelist() == names
+        assert archive.read(names[2]) == (place_of(served, third["id"]) / "mesh.stl").read_bytes()
+    wrongs: list[dict[str, Any]] = [{"scan": []}, {"scan": [str(uuid4())] * 51}, {**asked, "file": "record.json"}]
+    for wrong in wrongs:
+        assert client.get("/scan/files.zip", params=wrong).status_code == 422
+    assert refusal(client, "GET", f"/scan/files.zip?scan={first['id']}&scan={uuid4()}")[0] == 404
+    (place_of(served, second["id"]) / "mesh.ply").write_bytes(b"")
+    assert refusal(client, "GET", f"/scan/files.zip?scan={first['id']}&scan={second['id']}") == DAMAGED
+    served.order = "fail"
+    failed = ended(client, client.post("/scan").json()["id"])["id"]
+    assert refusal(client, "GET", f"/scan/files.zip?scan={first['id']}&scan={failed}") == NOT_READY
+
+
+@pytest.mark.usefixtures("commands")
+def test_scans_are_listed_renamed_fetched_and_deleted_by_command(client: TestClient, tmp_path: Path) -> None:
+    assert "slrig scan --output" in done("scans", "list")
+    first, second = (finished(client)["id"] for _ in range(2))
+    done("scans", "rename", first[:8], "Größe 7")
+    done("scans", "rename", second, "plate")
+    listed = done("scans", "list", "größe", "--state", "succeeded", "--since", "2026-01-01")
+    assert (first[:8] in listed, second[:8] in listed) == (True, False)
+    assert [each["id"] for each in json.loads(done("scans", "list", "--limit", "1", "--json"))["scans"]] == [second]
+    assert "no such scan" in done("scans", "list", "--until", "2026-01-01")
+    fetched = done("scans", "fetch", "Größe 7", "plate", "--output", tmp_path, "--file", "mesh.stl")
+    assert fetched.splitlines() == [str(tmp_path / f"bench-{each}-mesh.stl") for each in ("Größe-7", "plate")]
+    assert (tmp_path / "bench-plate-mesh.stl").read_bytes() == client.get(f"/scan/{second}/mesh.stl").content
+    assert "has no mesh.none" in refused(slrig("scans", "fetch", "plate", "--file", "mesh.none"))
+    assert "No scan is called 'Grö'" in refused(slrig("scans", "delete", "plate", "Grö", "--yes"))
+    client.put(f"/scan/{second}/pin")
+    assert "plate" in refused(slrig("scans", "delete", "Größe 7", "plate", "--yes"))
+    client.delete(f"/scan/{second}/pin")
+    done("scans", "rename", "plate", "Größe 7")
+    assert "2 scans are called" in refused(slrig("scans", "delete", "Größe 7", "--yes"))
+    assert slrig("scans", "delete", first[:8], second[:8], typed="n\n").exit_code == 1
+    assert len(client.get("/scan").json()["scans"]) == 2
+    assert done("scans", "delete", first[:8], second[:8], "--yes").count("deleted Größe 7") == 2
+    assert client.get("/scan").json()["scans"] == []
+
+
 def test_bundle_is_a_zip_of_stored_files_without_links(client: TestClient, served: ServedBench, tmp_path: Path) -> None:
     scan = finished(client)
     place = place_of(served, scan["id"])
@@ -344,7 +421,6 @@ def test_bundle_is_a_zip_of_stored_files_without_links(client: TestClient, serve
     (place / "bundle" / "more").symlink_to(tmp_path)
     answer = client.get(scan["links"]["files"]["bundle.zip"])
     assert answer.headers["content-type"] == "application/zip"
-    assert answer.headers["content-disposition"] == f'attachment; filename="{scan["id"]}.zip"'
     with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
         assert archive.testzip() is None
         names = archive.namelist()

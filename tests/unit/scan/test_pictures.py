@@ -10,7 +10,7 @@ import pytest
 from numba import config
 from numpy.typing import NDArray
 
-from slrig.errors import StorageError
+from slrig.errors import DamagedError, StorageError
 from slrig.kernels import in_bands
 from slrig.model import FloatArray, Mesh, Pinhole, Refusal, Size
 from slrig.scan import pictures
@@ -27,12 +27,12 @@ from slrig.scan.pictures import (
     resampled,
     resized,
 )
+from slrig.scan.thumbnail import BACKDROP, encode_thumbnail
 from tests.unit.scan.test_mesh_formats import only
 
 SIZE = Size(640, 480)
 PANEL = Size(520, 390)
 TOP = LEFT = 10
-BACKDROP = (74, 67, 63)
 
 
 def camera(distortion: tuple[float, ...] = (0, 0, 0, 0, 0), size: Size = SIZE) -> Pinhole:
@@ -104,6 +104,22 @@ def test_the_mesh_lies_where_the_camera_sees_it(distortion: tuple[float, ...]) -
     expected = (np.concatenate((pixels.min(axis=0), pixels.max(axis=0))) + 0.5) * scale - 0.5
     found = bounds(covered(panel(preview(mesh, seen_by, white(), 255), 1)))
     assert found == pytest.approx(expected, abs=1.0)
+
+
+def test_a_thumbnail_shows_the_turned_mesh_alone_as_large_as_it_fits() -> None:
+    shown = preview(patch((60, 40, 500), 80), camera(), white(), 255)
+    small = cv2.imdecode(np.frombuffer(encode_thumbnail(encode_png(shown)), dtype=np.uint8), cv2.IMREAD_COLOR)
+    assert small is not None
+    assert small.shape == (240, 320, 3)
+    left, top, right, bottom = bounds((small != BACKDROP).any(axis=2))
+    assert max((bottom - top + 1) / 240, (right - left + 1) / 320) == pytest.approx(0.86, abs=0.005)
+    assert (left + right, top + bottom) == pytest.approx((319, 239), abs=1)
+    # Neither letters nor scale, which are brighter than the mesh.
+    turned = panel(shown, 2)
+    redder = turned[..., 2] > turned[..., 0]
+    assert small.max() <= turned[redder].max()
+    with pytest.raises(DamagedError, match=r"preview\.png"):
+        encode_thumbnail(b"not a picture")
 
 
 def joined(first: Mesh, second: Mesh) -> Mesh:
