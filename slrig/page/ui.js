@@ -1,14 +1,34 @@
 // Parts that every screen is made of, and how values are written for people.
 import {html, useEffect, useState} from "./vendor/preact-htm.js";
 
-/** Millimetres in the unit that reads best. */
-export function length(mm) {
-  if (mm === null || mm === undefined || !Number.isFinite(mm)) return "not known";
-  return Math.abs(mm) < 0.1 ? `${Number((mm * 1000).toPrecision(3))} µm` : `${Number(mm.toPrecision(4))} mm`;
+/** A number for people: a real minus sign, narrow spaces between thousands. `decimals` are always shown; without, `digits` significant ones at most. */
+export function number(value, {digits = 3, decimals} = {}) {
+  if (!Number.isFinite(value)) return "not known";
+  const after = decimals ?? Math.min(Math.max(digits - 1 - Math.floor(Math.log10(Math.abs(value) || 1)), 0), 20);
+  const written = value.toLocaleString("en", {minimumFractionDigits: decimals ?? 0, maximumFractionDigits: after});
+  return written.replace(/^-(0[.0]*)$/, "$1").replace("-", "−").replaceAll(",", "\u202f");
 }
 
-export const count = (value) => (value ?? 0).toLocaleString("en");
-export const percent = (share) => `${Number((100 * share).toPrecision(3))} %`;
+/** A value in the first of its units that leaves it below `most`: `units` is a list of [unit, its size, most]. */
+function inUnit(value, units, options) {
+  if (!Number.isFinite(value)) return "not known";
+  const [unit, size] = units.find(([, , most]) => Math.abs(value) < most) ?? units.at(-1);
+  return `${number(value / size, options)}\u00a0${unit}`;
+}
+
+/** Millimetres in the unit that reads best. */
+export const length = (mm) => (mm === 0 ? "0\u00a0mm" : inUnit(mm, [["µm", 1e-3, 0.1], ["mm", 1, Infinity]], {digits: Math.abs(mm) < 0.1 ? 3 : 4}));
+/** Seconds in the unit that reads best. */
+export const duration = (s) => inUnit(s, [["µs", 1e-6, 1e-3], ["ms", 1e-3, 1], ["s", 1, 120], ["min", 60, 7200], ["h", 3600, 172800], ["days", 86400, Infinity]], {digits: s < 120 ? 3 : 2});
+export const bytes = (amount) => inUnit(amount, [["kB", 1e3, 1e6], ["MB", 1e6, 1e9], ["GB", 1e9, 1e12], ["TB", 1e12, Infinity]], {digits: 2});
+export const count = (value) => number(value ?? 0, {decimals: 0});
+
+/** A share of 1 as a percentage; one that is almost none or almost all is not rounded to that. */
+export function percent(share) {
+  if (share > 0 && share < 1e-4) return "<\u00a00.01\u00a0%";
+  if (share > 0.9995 && share < 1) return ">\u00a099.9\u00a0%";
+  return Number.isFinite(share) ? `${number(100 * share)}\u00a0%` : "not known";
+}
 
 /** A moment as people say it. */
 export function moment(text) {

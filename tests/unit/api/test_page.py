@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import json
 import re
+import shutil
+import subprocess
 
 import cv2
 import numpy as np
@@ -12,7 +15,7 @@ import pytest
 
 from slrig.api.rig import encoded, marked_picture
 from slrig.api.system import FOLDER, policy
-from tests.npm import npm_package
+from tests.npm import lacking, npm_package
 from tests.unit.api.conftest import ServedBench
 from tests.unit.api.test_access import stranger
 
@@ -93,6 +96,26 @@ def test_vendored_files_are_those_that_npm_publishes() -> None:
 def test_the_page_is_small() -> None:
     files = [path for path in FOLDER.rglob("*") if path.suffix in {".js", ".css", ".html", ".svg"}]
     assert sum(len(gzip.compress(path.read_bytes(), 6)) for path in files) < MOST_GZIPPED_BYTES
+
+
+WRITTEN = {
+    "length(0.0123)": "12.3 µm", "length(-143.25)": "−143.3 mm", "length(1234.5)": "1 235 mm",
+    "length(null)": "not known", "length(0)": "0 mm", "duration(0.012)": "12 ms", "duration(95.2)": "95.2 s", "duration(259200)": "3 days",
+    "bytes(5.25e9)": "5.3 GB", "count(1234567)": "1 234 567", "percent(0)": "0 %", "percent(3.7e-5)": "< 0.01 %",
+    "percent(0.9998)": "> 99.9 %", "percent(0.12345)": "12.3 %", "number(-1e-5, {decimals: 2})": "0.00",
+}  # fmt: skip
+
+
+def test_numbers_are_written_for_people() -> None:
+    node = shutil.which("node") or lacking("needs Node 18 or newer, to run the page's modules: apt install nodejs")
+    calls = ", ".join(f"ui.{each}" for each in WRITTEN)
+    program = f"import * as ui from '{(FOLDER / 'ui.js').as_uri()}'; console.log(JSON.stringify([{calls}]))"
+    done = subprocess.run(  # noqa: S603 - our own program
+        [node, "--input-type=module", "--eval", program], capture_output=True, text=True, check=True
+    )
+    # Narrow spaces, and those that keep a unit with its number.
+    found = json.loads(re.sub(r"[\u202f\xa0]", " ", done.stdout))
+    assert dict(zip(WRITTEN, found, strict=True)) == WRITTEN
 
 
 def test_marks_are_on_what_is_saturated_and_in_light_on_what_is_dark() -> None:
