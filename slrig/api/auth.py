@@ -526,7 +526,7 @@ class Access:
         if session is not None:
             owner = _let_in(ring.by_digest(session.key))
             return replace(owner, expires_at=session.expires_at)
-        raise _unauthorized("none" if cookie is None else "a session that is over")
+        raise _unauthorized("This service needs an API key." if cookie is None else "The session is over.")
 
     async def _refuse(
         self,
@@ -612,17 +612,17 @@ def _authority(url: str) -> str:
 
 def _let_in(key: Key | None) -> Caller:
     if key is None:
-        raise _unauthorized("another one")
+        raise _unauthorized("Unknown API key.")
     fault = key.fault(utc_now())
     if fault is not None:
-        raise _unauthorized(f"one that {fault}")
+        raise _unauthorized(f"This API key {fault}.")
     return Caller(key.name, key.scopes, key.expires_at, key.digest)
 
 
 def _unauthorized(found: str) -> Refused:
     detail = (
-        f"This service needs an API key, and the request has {found}. Send yours as 'Authorization: Bearer KEY' or "
-        "'X-API-Key: KEY'. Whoever runs the service makes one with `slrig key add NAME`."
+        f"{found} Send a key as 'Authorization: Bearer KEY' or 'X-API-Key: KEY'. Whoever runs the service makes one "
+        "with `slrig key add NAME`."
     )
     return Refused(401, "unauthorized", detail, {"WWW-Authenticate": "Bearer"})
 

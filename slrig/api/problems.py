@@ -49,6 +49,40 @@ RETRY_AFTER_S = {"rig-busy": 5, "queue-full": 30, "key-in-flight": 1, "worker-bu
 _NAMES = {413: "content-too-large", 416: "range-not-satisfiable", 422: "invalid-request"}
 # Python's own names for these differ from version to version.
 
+_TITLES = {
+    "artefact-not-ready": "The file is not ready yet",
+    "bundle": "The recorded scan cannot be used",
+    "calibration": "The calibration cannot be used",
+    "calibration-state": "The calibration does not allow this now",
+    "catalogue": "The shared catalogue does not answer",
+    "config": "A setting does not fit",
+    "damaged": "Files are damaged",
+    "device": "A device failed",
+    "device-busy": "Another program uses the device",
+    "device-gone": "A device is gone",
+    "device-state": "A device was asked in the wrong order",
+    "extra-missing": "A library is missing",
+    "foreign-page": "The request comes from another site",
+    "idempotency": "The request's key was used for another request",
+    "invalid-input": "A value does not fit",
+    "key-in-flight": "The same request is being answered",
+    "pattern": "The patterns do not fit",
+    "scan-evidence": "Frames do not show their patterns",
+    "scan-state": "The job does not allow this now",
+    "schedule": "The schedule cannot be kept",
+    "scope": "This key may not do that",
+    "service": "The service failed",
+    "slrig": "slrig failed",
+    "stage-refused": "The turntable's axis was refused",
+    "storage": "The disk refused",
+    "unauthorized": "Log in first",
+    "unexpected": "Unexpected error",
+    "unsupported-by-device": "The device cannot do this",
+    "worker-busy": "Too much is computed already",
+    "worker-lost": "The computation ended early",
+}
+"""Titles of problems whose codes do not read as words."""
+
 _MESSAGES = {
     "extra_forbidden": "There is no such field here; look at its spelling. /openapi.json lists those that there are.",
     "timezone_aware": "expected the offset from UTC, too, as in 2026-11-20T06:00:00Z",
@@ -85,11 +119,20 @@ class Problem(BaseModel):
     since: str | None = Field(default=None, description="since when")
 
 
+def title_of(code: str) -> str:
+    """What people call a kind of problem.
+
+    >>> title_of("config"), title_of("queue-full")
+    ('A setting does not fit', 'Queue full')
+    """
+    return _TITLES.get(code) or code.replace("-", " ").capitalize()
+
+
 def problem(status: int, code: str, detail: str, **members: Any) -> dict[str, Any]:
     """The members of a problem document, without those that are None."""
     document = {
         "type": f"/problems/{code}",
-        "title": code.replace("-", " ").capitalize(),
+        "title": title_of(code),
         "status": status,
         "detail": detail,
         **members,

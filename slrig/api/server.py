@@ -546,7 +546,7 @@ def _tell_keys(
         path = folder.root / _FIRST_KEY_FILE
         write_file(path, f"{key}\n".encode("ascii"))
         path.chmod(0o600)
-        say(f"A first API key was made; read it in {path}, then remove that file.")
+        say(f"First API key written to {path}. Copy it, then delete the file.")
 
 
 def _stop_at_eof() -> None:

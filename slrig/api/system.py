@@ -24,7 +24,7 @@ from starlette.middleware.gzip import GZipMiddleware
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
-from slrig.api.problems import answer, explanations, problem, problems
+from slrig.api.problems import answer, explanations, problem, problems, title_of
 from slrig.api.schemas import Explanation, Probe
 from slrig.api.service import Cursor, PageLength, Probed, Service, Serving, paged
 from slrig.calibration.health import HealthState
@@ -194,7 +194,7 @@ def explain_problem(name: Annotated[str, PathParameter(max_length=64)]) -> Expla
     if text is None:
         detail = f"There is no kind of problem '{name}'."
         raise HTTPException(404, detail)
-    return Explanation(type=f"/problems/{name}", title=name.replace("-", " ").capitalize(), description=text)
+    return Explanation(type=f"/problems/{name}", title=title_of(name), description=text)
 
 
 def _storage(check: Callable[[], None]) -> str:

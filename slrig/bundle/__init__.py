@@ -101,6 +101,7 @@ from slrig.bundle.validation import (
     read_text,
     read_toml,
     stored_json,
+    unreadable,
     validate,
 )
 from slrig.bundle.writing import (
@@ -191,6 +192,7 @@ __all__ = [
     "sync_tree",
     "turntable_entry",
     "turntable_record",
+    "unreadable",
     "validate",
     "write_bundle",
     "write_calibration",

@@ -133,10 +133,10 @@ def read_description(folder: Path) -> Description:
     """
     path = folder / DESCRIPTION
     if not path.is_file():
-        found = "a folder without it" if folder.is_dir() else "a file" if folder.is_file() else "no such folder"
+        found = f"there is no {DESCRIPTION} in it" if folder.is_dir() else "it is a file" if folder.is_file() else ""
         packed = f"unpack it (python3 -m zipfile -e {folder} NEW_FOLDER) and " if folder.suffix == ".zip" else ""
-        remedy = f"{packed}give the folder that holds it"
-        message = f"{path}: expected the description of a scan bundle, found {found}; {remedy}"
+        why = f"{found}; {packed}give the folder that holds {DESCRIPTION}" if found else "the folder does not exist"
+        message = f"{folder} is not a scan bundle: {why}"
         raise BundleError(message)
     name = "bundle description"
     description = read_json_model(path, Description, name, max_bytes=MAX_DESCRIPTION_BYTES, error=BundleError)

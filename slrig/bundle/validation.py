@@ -99,6 +99,17 @@ class Strict(BaseModel):
 Described = TypeVar("Described", bound=BaseModel)
 
 
+def unreadable(path: Path, cause: OSError) -> str:
+    """What to say of a file that cannot be read.
+
+    >>> unreadable(Path("rig.toml"), FileNotFoundError(2, "No such file or directory"))
+    'rig.toml: no such file'
+    """
+    if isinstance(cause, FileNotFoundError):
+        return f"{path}: no such file"
+    return f"{path}: expected a file that can be read, found: {cause.strerror}"
+
+
 def read_text(path: Path, max_bytes: int, error: type[InvalidInputError]) -> str:
     """Return the text of a small UTF-8 file.
     Raises InvalidInputError, of the class `error`: the file is missing, larger than `max_bytes`, or not text.
@@ -107,7 +118,7 @@ def read_text(path: Path, max_bytes: int, error: type[InvalidInputError]) -> str
         with path.open("rb") as file:
             data = file.read(max_bytes + 1)
     except OSError as cause:
-        raise error(f"{path}: expected a readable file, found: {cause.strerror}; check the path") from cause
+        raise error(unreadable(path, cause)) from cause
     if len(data) > max_bytes:
         raise error(
             f"{path}: expected at most {max_bytes} bytes, found a larger file; "

@@ -245,7 +245,7 @@ def run_demo(rig: Path | None, output: Path) -> None:
         removed = remove_earlier(client, scan)
     tell_result(scan, output)
     if removed:
-        typer.echo(f"{'removed':<10}{counted(removed, 'earlier demo scan')} of rig '{scan['rig']}' from {data}")
+        typer.echo(f"Note: {counted(removed, 'earlier demo scan')} of rig '{scan['rig']}' removed from {data}.")
     bundle = data / "scans" / scan["id"] / "bundle"
     _tell_next(rig, bundle, output)
     require_sound(scan)

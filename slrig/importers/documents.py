@@ -24,6 +24,7 @@ from slrig.bundle import (
     read_arrays,
     read_file_storage,
     read_text,
+    unreadable,
 )
 from slrig.disk import storage_errors
 from slrig.errors import CalibrationError
@@ -96,7 +97,7 @@ def _read_file(path: Path) -> Any:
         with path.open("rb") as file:
             data = file.read(MAX_BINARY_BYTES + 1)
     except OSError as cause:
-        raise CalibrationError(f"{path}: expected a readable file, found: {cause.strerror}; check the path") from cause
+        raise CalibrationError(unreadable(path, cause)) from cause
     if len(data) > MAX_BINARY_BYTES:
         raise CalibrationError(f"{path}: expected at most {MAX_BINARY_BYTES} bytes, found a larger file; {_ALONE}")
     if data.startswith((b"\x89HDF", b"MATLAB 7.3")):

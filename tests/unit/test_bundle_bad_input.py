@@ -374,10 +374,10 @@ def test_a_description_that_is_not_text_is_refused(folder: Path) -> None:
 
 
 def test_a_folder_without_description_is_refused(tmp_path: Path) -> None:
-    _fault(tmp_path, "bundle.json", "found a folder without it")
-    _fault(tmp_path / "nowhere", "found no such folder", "give the folder that holds it")
+    _fault(tmp_path, "there is no bundle.json in it")
+    _fault(tmp_path / "nowhere", "nowhere is not a scan bundle: the folder does not exist")
     (tmp_path / "bundle.zip").touch()
-    _fault(tmp_path / "bundle.zip", "found a file", "unpack it (python3 -m zipfile -e", "give the folder that holds it")
+    _fault(tmp_path / "bundle.zip", "it is a file", "unpack it (python3 -m zipfile -e", "give the folder that holds")
 
 
 def test_a_calibration_of_other_cameras_is_refused(folder: Path) -> None:

@@ -208,7 +208,7 @@ def test_demo_waits_for_the_rig_and_for_nothing_else() -> None:
         assert still_missing(client) is None
     with client_of(failing(httpx2.ConnectError("refused"))) as client:
         assert still_missing(client) == "the service is starting"
-    fault = "scene 'tabel.toml': expected a readable file"
+    fault = "scene 'tabel.toml': no such file"
     with client_of(lambda _: ready_answer(503, fault)) as client, pytest.raises(ServiceError, match="cannot be opened"):
         still_missing(client)
 

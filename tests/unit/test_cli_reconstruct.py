@@ -184,7 +184,7 @@ def test_broken_bundles_do_not_stop_the_others(scans: Path, tmp_path: Path, work
     # Files are looked at before anything is computed, and each error is told when it comes.
     first_done = result.stderr.index("1 of 5: scan-1")
     assert result.stderr.index(f"error: {scans / 'scan-2' / 'bundle.json'} is not a valid") < first_done
-    assert result.stderr.index(f"error: {scans / 'absent' / 'bundle.json'}: expected the description") < first_done
+    assert result.stderr.index(f"error: {scans / 'absent'} is not a scan bundle") < first_done
     assert result.stderr.index(f"error: {scans / 'scan-3'}: the lens cap is on") > first_done
     # The one that comes next begins with the stage that failed, and is told all the same.
     assert result.stderr.count("decode ") == 3
@@ -217,7 +217,10 @@ def test_nothing_is_computed_that_could_only_be_refused(scans: Path, tmp_path: P
             ((scans / "scan-1", "--output", out, "--file", name), f"it gives no {name}. There are: mesh.ply, ")
             for name in ("points-left.npz", "bundle.zip", "../mesh.stl")
         ),
-        ((tmp_path / "empty", "--output", out), "found a folder without it; give the folder that holds it"),
+        (
+            (tmp_path / "empty", "--output", out),
+            "there is no bundle.json in it; give the folder that holds bundle.json",
+        ),
         ((scans, tmp_path / "other" / "Scan-1", "--output", out), names),
         ((scans, "--output", file), "name a new folder"),
         ((scans, "--output", one), "name a new folder"),

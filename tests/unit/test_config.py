@@ -124,7 +124,7 @@ def test_every_fault_of_a_rig_is_in_one_message(tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         read_rig(_rig(tmp_path, text))
     assert len(str(caught.value).splitlines()) == 4
-    with pytest.raises(ConfigError, match=r"none\.toml: expected a readable file, found: No such file"):
+    with pytest.raises(ConfigError, match=r"none\.toml: no such file"):
         read_rig(tmp_path / "none.toml")
 
 

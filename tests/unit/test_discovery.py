@@ -254,7 +254,7 @@ def test_either_kind_of_rig_may_have_one_positioner_and_all_is_closed(tmp_path: 
             replace(sample_calibration(cameras=("left",)), projector=None),
             r"own\.json: .*of camera 'left' alone, without a projector",
         ),
-        (None, r"own\.json: expected a readable file"),
+        (None, r"own\.json: no such file"),
     ],
 )
 def test_calibration_that_does_not_fit_is_refused_and_all_is_closed(

@@ -219,7 +219,7 @@ def test_a_service_ends_with_the_program_that_started_it(tmp_path: Path) -> None
         assert b" at http://" in service.stdout.readline()
         # Without a terminal, what is printed may be kept as a log.
         printed = service.stdout.readline().decode()
-        assert f"A first API key was made; read it in {data / 'first-key'}" in printed
+        assert f"First API key written to {data / 'first-key'}" in printed
         assert (data / "first-key").read_text().strip() not in printed
         assert [path for path in (data, data / "first-key", data / "slrig.sqlite") if path.stat().st_mode & 0o077] == []
         service.stdin.close()

@@ -19,7 +19,7 @@ def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit:
     page = visit(service, key=None, ignored="401")
     page.get_by_label("Key").fill("not the key")
     page.get_by_role("button", name="Enter").click()
-    page.get_by_role("alert").get_by_text("needs an API key").wait_for()
+    page.get_by_role("alert").get_by_text("Unknown API key.").wait_for()
     assert violations(page) == []
     page.get_by_label("Key").fill(KEY)
     page.keyboard.press("Enter")

@@ -295,7 +295,7 @@ def test_a_camera_is_unplugged_and_a_key_expires(start: Start, tmp_path: Path, v
     assert violations(page) == []
     page.get_by_label("Key").fill(secret)
     page.get_by_role("button", name="Enter").click()
-    page.get_by_role("alert").get_by_text("one that expired on").wait_for()
+    page.get_by_role("alert").get_by_text("This API key expired on").wait_for()
     page.get_by_label("Key").fill(KEY)
     page.get_by_role("button", name="Enter").click()
     page.get_by_text("Logged in as environment").wait_for()

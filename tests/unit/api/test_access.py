@@ -359,7 +359,7 @@ def test_every_operation_has_the_scope_of_its_path() -> None:
 @pytest.mark.usefixtures("client")
 def test_a_key_that_is_over_opens_nothing(served: ServedBench, ring: KeyRing) -> None:
     mine = stranger(served, ring.add("Ann", [], life=timedelta(seconds=-1)))
-    assert "one that expired on" in mine.get("/scan").json()["detail"]
+    assert "This API key expired on" in mine.get("/scan").json()["detail"]
     mine = stranger(served, ring.add("Bob", []))
     assert mine.get("/scan").status_code == 200
     ring.revoke("Bob")
@@ -499,7 +499,7 @@ def test_a_session_ends_with_its_time_and_with_its_key(
     other = logged_in(served)
     now = sessions(served)._clock()
     monkeypatch.setattr(sessions(served), "_clock", lambda: now + timedelta(hours=12))
-    assert "a session that is over" in other.get("/scan").json()["detail"]
+    assert "The session is over." in other.get("/scan").json()["detail"]
 
 
 FOREIGN_PAGES = (
