@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 from urllib.parse import urlsplit
 
-from pydantic import ConfigDict, Field, SecretStr, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, SecretStr, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, EnvSettingsSource, NoDecode, SettingsConfigDict
 
 from slrig.bundle import (
@@ -234,6 +234,23 @@ def default_data_dir() -> Path:
     return Path(base) / "slrig"
 
 
+def _require_web_address(url: str) -> str:
+    try:
+        parts = urlsplit(url)
+        valid = parts.scheme in {"http", "https"} and bool(parts.hostname)
+    except ValueError:
+        valid = False
+    if not valid:
+        # The message does not repeat the address, which often holds a secret.
+        message = "expected an address that begins with http:// or https:// and a host; correct it or leave it out"
+        raise ValueError(message)
+    return url
+
+
+WebAddress = Annotated[str, Field(max_length=2000), AfterValidator(_require_web_address)]
+"""An address of the web, such as that of a webhook."""
+
+
 class ServiceSettings(BaseSettings):
     """Settings of the service, from `SLRIG_…` in the environment, then a TOML file, then these defaults.
 
@@ -289,7 +306,7 @@ class ServiceSettings(BaseSettings):
     keep_scans_bytes: Annotated[int, Field(ge=1)] | None = None
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     log_format: Literal["auto", "text", "json"] = "auto"
-    webhook_url: Annotated[str, Field(max_length=2000)] | None = None
+    webhook_url: WebAddress | None = None
     webhook_secret: SecretStr | None = None
     webhook_secret_file: Path | None = None
     webhook_kinds: Annotated[tuple[NoticeKind, ...], NoDecode] = get_args(NoticeKind)
@@ -328,22 +345,10 @@ class ServiceSettings(BaseSettings):
             raise ValueError(message)  # noqa: TRY004 - pydantic collects ValueErrors only
         return secret or None
 
-    @field_validator("mqtt_url", "catalogue")
+    @field_validator("mqtt_url", "catalogue", "webhook_url", mode="before")
     @classmethod
-    def _empty_is_none(cls, url: str | None) -> str | None:
+    def _empty_is_none(cls, url: object) -> object:
         return url or None
-
-    @field_validator("webhook_url")
-    @classmethod
-    def _check_web_address(cls, url: str | None) -> str | None:
-        if not url:
-            return None
-        parts = urlsplit(url)
-        if parts.scheme not in {"http", "https"} or not parts.hostname:
-            # The message does not repeat the address, which often holds a secret.
-            message = "expected an address that begins with http:// or https:// and a host; correct it or leave it out"
-            raise ValueError(message)
-        return url
 
     @model_validator(mode="after")
     def _require_key_beyond_loopback(self) -> Self:

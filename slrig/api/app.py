@@ -19,7 +19,7 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from slrig.api import acceptance, auth, calibration, events, files, models, rig, scans, schedules, system
+from slrig.api import acceptance, auth, calibration, events, files, models, notices, rig, scans, schedules, system
 from slrig.api.auth import LOCAL_NAMES, Access, BodyLimits, KeyRing, SecurityHeaders, Sessions
 from slrig.api.calibration import IMPORT_PATH, MOST_IMPORT_BYTES
 from slrig.api.problems import PlainErrorsToProblems, answer, describe, install_problems, problem
@@ -131,6 +131,7 @@ def bare_app() -> FastAPI:
         rig.turntable_router,
         acceptance.router,
         schedules.router,
+        notices.router,
         auth.router,
         system.router,
         router,

@@ -48,7 +48,7 @@ from slrig.model_jobs.job import MODELS, TURNTABLE, Models, ViewShooting
 from slrig.model_jobs.turntable import TurntableStore
 from slrig.plugins import OBSERVERS, load, plugin_errors
 from slrig.scan.plan import Presets
-from slrig.schedule.notices import NoticedHealth, senders_of, tell_run
+from slrig.schedule.notices import NoticedHealth, Receivers, tell_run
 from slrig.schedule.scheduler import Scheduler, Tasks
 from slrig.schedule.store import ScheduledRun, ScheduleStore
 
@@ -169,7 +169,7 @@ class Service:
         The disk refused. What was given is still the caller's to close.
     ConfigError
         A plug-in cannot be loaded, or what it needs is not installed. Or a receiver of notices
-        cannot be told: see `senders_of`. Or the catalogue has no address, or no login.
+        cannot be told: see `Receivers`. Or the catalogue has no address, or no login.
     ExtraMissingError
         The catalogue's driver is not installed.
     """
@@ -205,7 +205,7 @@ class Service:
         self.probes = Makings(Shares("probes", 6, again, status=503, at_once=3))
         self._lasting: frozenset[str] = frozenset()
         database, outbox = self.store.database, self.store.outbox
-        self.senders = senders_of(settings, outbox)
+        self.receivers = Receivers(settings, outbox, self.folder.root)
         newest = self.store.page(JobKind.SCAN, before=None, limit=1)
         clock = SteadyClock(self.folder.root / CLOCK, first=newest[0].created_at if newest else None)
         outbox.clock = clock.now
@@ -234,7 +234,7 @@ class Service:
         self.shooting.take_up()
         self.store.after_end = self._ended
         self.copier = self._copier()
-        self._tellers = (*self.senders, *(() if self.copier is None else (self.copier,)))
+        self._tellers = (self.receivers, *(() if self.copier is None else (self.copier,)))
         self.retention = Retention(
             self.folder.root,
             [
@@ -311,7 +311,10 @@ class Service:
 
     def dead_threads(self) -> list[str]:
         """Names of threads that have ended, and should last as long as the service."""
-        return [] if self.manager.ending else sorted(self._lasting - _lasting_threads())
+        alive = _lasting_threads()
+        # One of a webhook that was set meanwhile is new.
+        self._lasting |= alive
+        return [] if self.manager.ending else sorted(self._lasting - alive)
 
     def drain(self) -> None:
         """Begin nothing new, and let what has the rig come to its end, as long as the settings allow, or until

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import importlib.metadata
+import platform
 import re
+import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
@@ -18,7 +21,7 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 from prometheus_client.registry import Collector
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.staticfiles import StaticFiles
@@ -150,6 +153,31 @@ class _Figures(Collector):
             if schedule.order.enabled:
                 due.add_metric([str(schedule.id), schedule.order.task], schedule.next_due.timestamp())
         yield due
+
+
+class ServiceBody(BaseModel):
+    """The service's version, its disk, and what is damaged in its data folder."""
+
+    version: str
+    python: str
+    free_bytes: int
+    total_bytes: int
+    spare_bytes: int = Field(description="below so much free space nothing new is begun")
+    damaged: dict[JobKind, int] = Field(description="jobs whose record or files are damaged, by kind")
+
+
+@router.get("/service")
+def look_at_service(service: Serving) -> ServiceBody:
+    """Return the version of the service, the space on its disk, and how many jobs are damaged."""
+    disk = shutil.disk_usage(service.folder.root)
+    return ServiceBody(
+        version=importlib.metadata.version("slrig"),
+        python=platform.python_version(),
+        free_bytes=disk.free,
+        total_bytes=disk.total,
+        spare_bytes=service.settings.min_free_bytes,
+        damaged=service.store.damaged(),
+    )
 
 
 @router.get("/livez", openapi_extra={"security": []})

@@ -25,6 +25,7 @@ from slrig.client.resources import (
     Examinations,
     IfBusy,
     Models,
+    Notices,
     PresetResource,
     ProgressCallback,
     RigHealth,
@@ -344,6 +345,7 @@ class Client:
         self.turntable = TurntableResource(self.connection)
         self.accept = Acceptance(self.connection)
         self.schedules = Schedules(self.connection)
+        self.notices = Notices(self.connection)
         self.system = System(self.connection)
 
     def scan(

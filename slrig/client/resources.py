@@ -698,6 +698,26 @@ class Schedules(Resource):
         return self._connection.json("POST", path("/schedule/{}/cancel", schedule_id))
 
 
+class Notices(Resource):
+    """Who is told of failed and missed runs, of changes of the rig's health and of jobs that ended."""
+
+    def list(self) -> Json:
+        """The receivers: host, kinds of notices, and how many wait."""
+        return self._connection.json("GET", "/notices")
+
+    def set_webhook(self, url: str, kinds: Sequence[str] | None = None) -> Json:
+        """Have notices sent to an address by POST; all kinds unless some are named."""
+        return self._connection.json("PUT", "/notices/webhook", json=given(url=url, kinds=kinds))
+
+    def remove_webhook(self) -> None:
+        """Send nothing more to the webhook that was set."""
+        self._connection.send("DELETE", "/notices/webhook")
+
+    def test(self, receiver: str) -> Json:
+        """Send a notice that tells of nothing, once, and tell how it went."""
+        return self._connection.json("POST", path("/notices/{}/test", receiver))
+
+
 class System(Resource):
     """The service itself."""
 
@@ -718,6 +738,10 @@ class System(Resource):
                 raise
             found = error.problem
         return {"checks": dict(found["checks"]), "pending": [*found.get("pending", ())]}
+
+    def about(self) -> Json:
+        """The version of the service, the space on its disk, and how many jobs are damaged."""
+        return self._connection.json("GET", "/service")
 
     def metrics(self) -> str:
         """Figures for Prometheus."""

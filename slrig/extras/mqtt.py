@@ -89,4 +89,5 @@ class Broker(Sender):
             client.disconnect()
         if not answers:
             return "no answer"
+        self.answer = f"the broker answered: {answers[0]}"
         return str(answers[0]) if answers[0].is_failure else None

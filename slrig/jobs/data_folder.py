@@ -9,6 +9,7 @@ DATA/calibrations/   calibrations and their sessions: see `slrig.calibrate.store
 DATA/acceptance/     acceptance tests: see `slrig.accept.store`
 DATA/models/         models of several scans: see `slrig.model_jobs.job`
 DATA/presets/NAME.json  presets that were put: see `slrig.scan.plan`
+DATA/webhook.json    the webhook that was set by request: see `slrig.schedule.notices`
 DATA/clock.json      the time that ages are reckoned by: see `slrig.jobs.retention`
 DATA/doctor.json     what `slrig doctor` found last, and conform.json: see `slrig.doctor.job`
 DATA/.incoming/ID/   a scan, a pose, a solve or a model being made; swept at the next start

@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from itertools import islice
-from typing import Any
+from typing import Any, Literal
 from uuid import UUID, uuid4
 
 import structlog
@@ -170,17 +170,37 @@ class Outbox:
     ) -> None:
         self.database = database
         self._rig = rig
-        self._wanted = wanted or {}
+        self._wanted = dict(wanted or {})
         self.clock = clock
         self._most = most
         self.news = {receiver: threading.Event() for receiver in self._wanted}
         self.dropped = 0
         self.copies = copies
 
+    @property
+    def wanted(self) -> Mapping[str, Collection[NoticeKind]]:
+        """The kinds that each receiver wants now."""
+        return self._wanted
+
+    def want(self, receiver: str, kinds: Collection[NoticeKind]) -> None:
+        """From now on put what a receiver wants; with no kinds, put nothing for it, and forget what waits."""
+        self.news.setdefault(receiver, threading.Event())
+        # Another mapping: threads may be reading the one that there was.
+        others = {name: wanted for name, wanted in self._wanted.items() if name != receiver}
+        self._wanted = {**others, receiver: kinds} if kinds else others
+        if not kinds:
+            with self.database.changing() as session:
+                session.execute(delete(NoticeRow).where(NoticeRow.receiver == receiver))
+
+    def body(self, kind: NoticeKind | Literal["test"], words: str) -> dict[str, Any]:
+        """What every notice has. words : what it says to people, but for the rig."""
+        told = f"rig '{self._rig}': {words}"
+        return {"id": f"msg_{uuid4().hex}", "kind": kind, "at": stamp(self.clock()), "rig": self._rig, "words": told}
+
     def put(self, session: Session, kind: NoticeKind, words: str, /, **members: Mapping[str, Any]) -> None:
         """Have a notice sent once the session's changes are kept. words : what it says to people, but for the rig."""
-        notice_id, at = f"msg_{uuid4().hex}", stamp(self.clock())
-        body = {"id": notice_id, "kind": kind, "at": at, "rig": self._rig, "words": f"rig '{self._rig}': {words}"}
+        body = self.body(kind, words)
+        notice_id, at = body["id"], body["at"]
         # Those of receivers that are no longer in the settings wait for as long, in case these come back.
         old = NoticeRow.at < stamp(self.clock() - KEPT_FOR)
         session.execute(delete(NoticeRow).where(NoticeRow.receiver.not_in(self._wanted), old))

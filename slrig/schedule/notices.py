@@ -10,19 +10,22 @@ import hashlib
 import hmac
 import ssl
 import threading
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, get_args
+from typing import Annotated, Any, ClassVar, get_args
 from urllib.parse import urlsplit
 
 import structlog
-from pydantic import SecretStr
+from pydantic import Field, SecretStr
 from sqlalchemy.orm import Session
 
+from slrig.bundle import Strict, read_json_model, write_file
 from slrig.calibrate.verification import HealthStore, VerificationRecord
 from slrig.calibration.health import HealthState
-from slrig.config import NoticeKind, ServiceSettings, read_private_text
+from slrig.config import NoticeKind, ServiceSettings, WebAddress, read_private_text
 from slrig.errors import ConfigError, StorageError
 from slrig.failure import LastingThread
 from slrig.jobs.database import Database
@@ -105,14 +108,34 @@ _REFUSED_S = 5.0
 _log = structlog.get_logger(__name__)
 
 
+_CAUSES = {
+    "ConnectError": "no connection: look at the address, and whether something listens there",
+    "ConnectionRefusedError": "no connection: nothing listens at that address and port",
+    "gaierror": "there is no host of that name",
+    **dict.fromkeys(("ConnectTimeout", "ReadError", "ReadTimeout", "TimeoutError"), "no answer in time"),
+}
+"""What the errors of a try mean, by their classes' names."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """How a test notice went. answer : of the receiver, or why there was none. sent : the notice."""
+
+    taken: bool
+    answer: str
+    seconds: float
+    sent: Mapping[str, Any]
+
+
 class Sender(ABC):
     """Sends notices on a thread of its own. Nothing waits for it, but `close`, for a second at most.
 
     A notice is sent again until its receiver takes it, and then forgotten. receiver : its name in the outbox. host :
-    what logs say of its address.
+    what logs say of its address. answer : what the receiver answered last, in words.
     """
 
     receiver: ClassVar[str]
+    answer: str = ""
 
     def __init__(self, outbox: Outbox, host: str) -> None:
         self.host = host
@@ -129,8 +152,9 @@ class Sender(ABC):
         """Send a notice once. Returns why it was not taken. May raise anything: the next try may get through."""
 
     def start(self) -> None:
-        """Begin to send."""
-        self._thread.start()
+        """Begin to send. Does nothing where it has begun."""
+        if not self._thread.is_alive():
+            self._thread.start()
 
     def close(self) -> None:
         """Send no more than what waits, and that only if it goes quickly. Idempotent."""
@@ -149,16 +173,28 @@ class Sender(ABC):
             return None if notice is None else LONGEST_WAIT_S
         # One that could not be taken off the record is not sent again by this process.
         if notice.id != self._taken:
-            try:
-                cause = self.refusal(notice)
-            except BaseException as error:  # noqa: BLE001 - whatever it was, the next try may get through
-                cause = type(error).__name__
+            cause = self._sent(notice)
             if cause is not None:
                 return self._failed(notice, cause)
         self._taken, self._failures = notice.id, 0
         if not self._left:
             self._outbox.sent(notice)
         return 0.0
+
+    def try_out(self) -> Trial:
+        """Send a notice that tells of nothing, once, before those that wait."""
+        notice = Notice(0, "", self._outbox.body("test", "this is a test notice; nothing has happened"))
+        notice = replace(notice, id=notice.body["id"])
+        begun_s = time.monotonic()
+        cause = self._sent(notice)
+        seconds = round(time.monotonic() - begun_s, 3)
+        return Trial(cause is None, _CAUSES.get(cause or "", cause) or self.answer, seconds, notice.body)
+
+    def _sent(self, notice: Notice) -> str | None:
+        try:
+            return self.refusal(notice)
+        except BaseException as error:  # noqa: BLE001 - whatever it was, the next try may get through
+            return type(error).__name__
 
     def _failed(self, notice: Notice, cause: str) -> float:
         told = {"receiver": self.receiver, "host": self.host, "cause": cause}
@@ -187,6 +223,7 @@ class Sender(ABC):
 
 
 _GONE = 410
+_MOST_BYTES = 2**14
 _KEY_BYTES = range(24, 65)
 
 
@@ -226,13 +263,18 @@ class Webhook(Sender):
     def __init__(
         self, outbox: Outbox, url: str, key: bytes | None, *, clock: Clock = utc_now, timeout_s: float = TIMEOUT_S
     ) -> None:
-        # The rest of the address often holds a secret.
-        super().__init__(outbox, urlsplit(url).hostname or "")
-        self._url = url
+        super().__init__(outbox, "")
+        self.send_to(url)
         self._key = key
         self._clock = clock
         self._timeout_s = timeout_s
         self._tls: ssl.SSLContext | None = None
+
+    def send_to(self, url: str) -> None:
+        """Send to another address from now on; one that is gone is forgiven."""
+        # The rest of the address often holds a secret.
+        self._url, self.host = url, urlsplit(url).hostname or ""
+        self._gone, self._failures = False, 0
 
     def refusal(self, notice: Notice) -> str | None:
         """See `Sender`."""
@@ -242,7 +284,8 @@ class Webhook(Sender):
             headers["webhook-signature"] = signature(self._key, notice.id, timestamp, notice.content)
         status = self._status(notice.content, headers)
         self._gone = status == _GONE
-        return None if 200 <= status < 300 else f"status {status}"
+        self.answer = f"status {status}"
+        return None if 200 <= status < 300 else self.answer
 
     def _status(self, body: bytes, headers: dict[str, str]) -> int:
         # Loaded by those who use it.
@@ -263,6 +306,85 @@ class Webhook(Sender):
                 whole.cancel()
 
 
+class WebhookEntry(Strict):
+    """A webhook that was set by request, in place of none in the settings: DATA/webhook.json."""
+
+    url: WebAddress
+    kinds: Annotated[tuple[NoticeKind, ...], Field(strict=False, min_length=1)] = get_args(NoticeKind)
+
+
+class Receivers:
+    """Who is told of notices: those of the settings, and a webhook that was set by request. Any thread may call.
+
+    `open` has the sender of each, by its name; `fixed` the names that the settings give. Raises ConfigError: see
+    `senders_of`.
+    """
+
+    def __init__(self, settings: ServiceSettings, outbox: Outbox, root: Path) -> None:
+        self.open = {sender.receiver: sender for sender in senders_of(settings, outbox)}
+        self.fixed = frozenset(self.open)
+        self._settings, self._outbox, self._path = settings, outbox, root / "webhook.json"
+        self._lock = threading.Lock()
+        self._started = False
+        # One that was removed waits for nothing, and sends to the next address.
+        self._webhook: Webhook | None = None
+        if Webhook.receiver not in self.fixed and self._path.is_file():
+            try:
+                kept = read_json_model(self._path, WebhookEntry, "webhook", max_bytes=_MOST_BYTES, error=ConfigError)
+            except ConfigError as error:
+                _log.error("the webhook is not told of anything: set it again", cause=str(error))
+            else:
+                self._use(kept)
+
+    def start(self) -> None:
+        """Begin to send."""
+        self._started = True
+        for sender in self.open.values():
+            sender.start()
+
+    def close(self) -> None:
+        """See `Sender.close`."""
+        for sender in filter(None, (*self.open.values(), self._webhook)):
+            sender.close()
+
+    def get(self, name: str) -> Sender:
+        """A receiver. Raises ConfigError."""
+        if name not in self.open:
+            message = f"There is no receiver '{name}', but: {', '.join(self.open) or 'none'}. GET /notices lists them."
+            raise ConfigError(message)
+        return self.open[name]
+
+    def set_webhook(self, entry: WebhookEntry) -> None:
+        """Send to this address from now on, also after a restart. Raises ConfigError: the settings have one."""
+        self._require_free()
+        with self._lock:
+            write_file(self._path, entry.model_dump_json().encode())
+            self._path.chmod(0o600)
+            self._use(entry)
+
+    def remove_webhook(self) -> None:
+        """Send nothing more to the webhook that was set, nor what waits for it. Idempotent. Raises ConfigError."""
+        self._require_free()
+        with self._lock:
+            self._path.unlink(missing_ok=True)
+            self._outbox.want(Webhook.receiver, ())
+            self.open.pop(Webhook.receiver, None)
+
+    def _require_free(self) -> None:
+        if Webhook.receiver in self.fixed:
+            message = "The webhook is set in the service's settings (webhook_url). Change it there."
+            raise ConfigError(message)
+
+    def _use(self, entry: WebhookEntry) -> None:
+        self._outbox.want(Webhook.receiver, entry.kinds)
+        if self._webhook is None:
+            self._webhook = Webhook(self._outbox, entry.url, _signing_key(self._settings))
+        self._webhook.send_to(entry.url)
+        self.open[Webhook.receiver] = self._webhook
+        if self._started:
+            self._webhook.start()
+
+
 def wanted_kinds(settings: ServiceSettings) -> Mapping[str, Collection[NoticeKind]]:
     """Kinds of notices for each named receiver; all kinds for other receivers than the webhook. Raises ConfigError."""
     kinds = dict.fromkeys(_named_receivers(settings), get_args(NoticeKind))
@@ -273,12 +395,16 @@ def senders_of(settings: ServiceSettings, outbox: Outbox) -> list[Sender]:
     """One sender for each receiver. Raises ConfigError: an address or secret is invalid, or an extra is missing."""
     found: list[Sender] = []
     if settings.webhook_url is not None:
-        secret, source = secret_of(settings.webhook_secret, settings.webhook_secret_file, "webhook_secret")
-        found.append(Webhook(outbox, settings.webhook_url, None if secret is None else signing_key(secret, source)))
+        found.append(Webhook(outbox, settings.webhook_url, _signing_key(settings)))
     for name, open_sender in _named_receivers(settings).items():
         with plugin_errors(RECEIVERS, name):
             found.append(open_sender(settings, outbox))
     return found
+
+
+def _signing_key(settings: ServiceSettings) -> bytes | None:
+    secret, source = secret_of(settings.webhook_secret, settings.webhook_secret_file, "webhook_secret")
+    return None if secret is None else signing_key(secret, source)
 
 
 def _named_receivers(settings: ServiceSettings) -> Mapping[str, Callable[[ServiceSettings, Outbox], Sender]]:

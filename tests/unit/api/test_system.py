@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import importlib.metadata
 import json
 import threading
 from dataclasses import fields
@@ -52,6 +53,25 @@ def test_rig_says_what_it_is_and_how_its_cameras_are_set(client: TestClient, ser
     settings.clear()
     assert (camera["exposure_s"], camera["gain"]) == (0.01, 1.0)
     assert "asked for an exposure of 20 ms, and uses 10 ms" in camera["notes"][0]
+
+
+def test_a_webhook_is_set_by_request_and_its_address_is_not_told(client: TestClient) -> None:
+    assert client.get("/notices").json() == {"receivers": []}
+    assert client.put("/notices/webhook", json={"url": "ftp://host/hidden"}).status_code == 422
+    assert client.post("/notices/webhook/test").status_code == 422
+    put = client.put("/notices/webhook", json={"url": "http://host/hidden", "kinds": ["run.failed"]})
+    (receiver,) = client.get("/notices").json()["receivers"]
+    assert (receiver["host"], receiver["kinds"], receiver["fixed"]) == ("host", ["run.failed"], False)
+    assert (put.status_code, "hidden" in put.text) == (200, False)
+    assert client.delete("/notices/webhook").status_code == 204
+    assert client.get("/notices").json() == {"receivers": []}
+
+
+def test_service_tells_its_version_disk_and_damage(client: TestClient) -> None:
+    found = client.get("/service").json()
+    assert found["version"] == importlib.metadata.version("slrig")
+    assert 0 < found["free_bytes"] < found["total_bytes"]
+    assert found["damaged"] == {}
 
 
 @pytest.mark.slow

@@ -19,7 +19,18 @@ from slrig.failure import JobFailure
 from slrig.jobs.database import Database
 from slrig.jobs.records import JobKind, JobRecord, JobState, acting_as
 from slrig.jobs.store import JobStore, Notice, Outbox
-from slrig.schedule.notices import TOLD, NoticedHealth, Sender, Webhook, senders_of, signature, signing_key, tell_run
+from slrig.schedule.notices import (
+    TOLD,
+    NoticedHealth,
+    Receivers,
+    Sender,
+    Webhook,
+    WebhookEntry,
+    senders_of,
+    signature,
+    signing_key,
+    tell_run,
+)
 from slrig.schedule.store import Cron, RunState, Schedule, ScheduledRun, ScheduleSpec, TaskKind
 from tests.samples import put_database
 from tests.unit.calibrate.health_bench import a_verification, hours
@@ -529,3 +540,43 @@ def test_what_waits_for_a_receiver_that_is_no_longer_named_is_dropped_as_late_as
         with database.changing() as session:
             outbox.put(session, "run.failed", "a run")
         assert outbox.waiting("mqtt")[0] == left
+
+
+def test_a_webhook_is_set_tried_and_removed_while_the_service_runs(tmp_path: Path, bench: Bench, hook: Hook) -> None:
+    outbox = Outbox(bench.database, rig="bench")
+    receivers = Receivers(ServiceSettings(), outbox, tmp_path)
+    with pytest.raises(ConfigError, match="no receiver 'webhook', but: none"):
+        receivers.get("webhook")
+    receivers.start()
+    receivers.set_webhook(WebhookEntry(url="http://127.0.0.1:1/elsewhere", kinds=("run.failed",)))
+    assert receivers.get("webhook").try_out().answer.startswith("no connection")
+    receivers.set_webhook(WebhookEntry(url=hook.url, kinds=("run.failed",)))
+    tried = receivers.get("webhook").try_out()
+    assert (tried.taken, tried.answer, hook.next()["words"]) == (True, "status 204", tried.sent["words"])
+    hook.status = 500
+    assert (receivers.get("webhook").try_out().taken, hook.next()["kind"]) == (False, "test")
+    hook.status = 204
+    with bench.database.changing() as session:
+        outbox.put(session, "run.missed", "not wanted")
+        outbox.put(session, "run.failed", "wanted")
+    assert hook.next()["words"] == "rig 'bench': wanted"
+    receivers.close()
+
+    again = Receivers(ServiceSettings(), outbox, tmp_path)
+    assert again.get("webhook").try_out().taken
+    hook.next()
+    assert (tmp_path / "webhook.json").stat().st_mode & 0o077 == 0
+    with bench.database.changing() as session:
+        outbox.put(session, "run.failed", "too late")
+    again.remove_webhook()
+    assert (outbox.waiting("webhook")[0], outbox.wanted, again.open) == (0, {}, {})
+    assert not Receivers(ServiceSettings(), outbox, tmp_path).open
+    (tmp_path / "webhook.json").write_text("damaged")
+    with structlog.testing.capture_logs() as log:
+        assert not Receivers(ServiceSettings(), outbox, tmp_path).open
+    assert [each["event"] for each in log] == ["the webhook is not told of anything: set it again"]
+
+    outbox = Outbox(bench.database, wanted={"webhook": ["run.failed"]})
+    fixed = Receivers(ServiceSettings(webhook_url=hook.url), outbox, tmp_path)
+    with pytest.raises(ConfigError, match="webhook_url"):
+        fixed.set_webhook(WebhookEntry(url="http://host"))
