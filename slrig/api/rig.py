@@ -513,6 +513,7 @@ class TurntableBody(BaseModel):
     """What is known of the turntable. `document` can be kept, and put back with PUT."""
 
     state: TurntableState
+    own_axis: bool = Field(description="no axis was measured, and the rig's own is used")
     remedy: str = Field(description="what to do; empty where nothing is to be done")
     point_sigma_mm: float | None = Field(description="standard deviation of the axis' point across it")
     direction_sigma_deg: float | None = Field(description="the same of its direction")
@@ -572,7 +573,7 @@ class AxisBody(TurntableBody):
 @turntable_router.get("/turntable")
 def get_turntable(service: Serving) -> TurntableBody:
     """Return the axis of the turntable, its planes, how the axis came to be, and whether it still holds."""
-    return _turntable(service.turntable.record())
+    return _turntable(service, service.turntable.record())
 
 
 @turntable_router.get("/turntable.svg", response_class=Response, responses=file_of("image/svg+xml"))
@@ -610,7 +611,7 @@ def calibrate_turntable(service: Serving, request: Annotated[AxisRequest, Body()
         )
         for name, left in found.residual_mm.items()
     ]
-    return AxisBody(**dict(_turntable(turntable)), poses=poses)
+    return AxisBody(**dict(_turntable(service, turntable)), poses=poses)
 
 
 @turntable_router.post("/turntable/shoot", status_code=202, responses=problems(409, 429, 502, 503, 507))
@@ -642,13 +643,13 @@ def find_planes(service: Serving, request: Annotated[PlanesRequest, Body()]) -> 
         Task(turntable_planes, (mesh, service.turntable.axis()), what="planes of the turntable"),
         within_s=REQUEST_WAIT_S,
     )
-    return _turntable(service.turntable.put_planes(found))
+    return _turntable(service, service.turntable.put_planes(found))
 
 
 @turntable_router.put("/turntable", responses=problems(507))
 def replace_turntable(service: Serving, request: Annotated[TurntableEntry, Body()]) -> TurntableBody:
     """Put back a document that was kept, in place of all that is known."""
-    return _turntable(service.turntable.replace(turntable_record(request)))
+    return _turntable(service, service.turntable.replace(turntable_record(request)))
 
 
 @turntable_router.delete("/turntable", status_code=204, responses=problems(507))
@@ -657,11 +658,12 @@ def delete_turntable(service: Serving) -> None:
     service.turntable.delete()
 
 
-def _turntable(record: TurntableRecord) -> TurntableBody:
-    state, remedy = state_of(record)
-    axis = record.axis
+def _turntable(service: Service, record: TurntableRecord) -> TurntableBody:
+    axis, own = record.axis, service.manager.rig.axis
+    state, remedy = state_of(record, own)
     return TurntableBody(
         state=state,
+        own_axis=axis is None and own is not None,
         remedy=remedy,
         point_sigma_mm=None if axis is None else axis.point_sigma_mm,
         direction_sigma_deg=None if axis is None else float(np.rad2deg(axis.direction_sigma_rad)),

@@ -181,7 +181,7 @@ def turntable_planes(mesh: Path, axis: MeasuredAxis | None) -> tuple[TurntablePl
 class Models:
     """Has models made: the `Group` of models. Any thread may call.
 
-    turntable : knows its axis and planes, and learns of each model's axis. spare_bytes : left free on the disk.
+    turntable : knows its axis and planes, and learns of each model's axis; without an axis, the rig's own counts. spare_bytes : left free on the disk.
     """
 
     def __init__(self, manager: JobManager, *, turntable: TurntableStore, spare_bytes: int = 0) -> None:
@@ -240,11 +240,11 @@ class Models:
         poses = plan.poses
         if not isinstance(poses, TurntablePoses) or poses.axis is not None:
             return plan
-        axis = self._turntable.axis()
+        axis = self._turntable.axis() or self._manager.rig.axis
         if axis is None:
             message = (
-                "axis: expected that of the turntable, and none is known here; say axis, with point_mm and direction "
-                "in the scans' frame, or give the poses"
+                "axis: expected that of the turntable, and none is known here. Measure it with a board on the "
+                'turntable (POST /rig/turntable/shoot), or leave it out of the matter: "poses": "unknown" or "markers"'
             )
             raise ConfigError(message)
         stated = StatedAxis.of(axis.point_mm, axis.direction)

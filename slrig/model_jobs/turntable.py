@@ -30,7 +30,15 @@ from slrig.disk import storage_errors
 from slrig.errors import ConfigError, StorageError
 from slrig.jobs.job import Job, Outcome
 from slrig.jobs.records import utc_now
-from slrig.model import AXIS_SPAN_MM, MAX_AXIS_SIGMAS, AxisUpdate, MeasuredAxis, TurntablePlane, update_axis
+from slrig.model import (
+    AXIS_SPAN_MM,
+    MAX_AXIS_SIGMAS,
+    AxisUpdate,
+    MeasuredAxis,
+    RotationAxis,
+    TurntablePlane,
+    update_axis,
+)
 from slrig.reports.page import (
     END,
     GAP,
@@ -59,12 +67,13 @@ class TurntableState(StrEnum):
     MOVED = "moved"
 
 
-def state_of(record: TurntableRecord) -> tuple[TurntableState, str]:
-    """The state of a turntable, and what to do about it; empty where nothing is to be done."""
-    if record.axis is None:
+def state_of(record: TurntableRecord, own: RotationAxis | None) -> tuple[TurntableState, str]:
+    """The state of a turntable, and what to do about it; empty where nothing is to be done. own : the axis that the rig
+    knows by itself.
+    """
+    if record.axis is None and own is None:
         return TurntableState.UNKNOWN, (
-            "stand a board on the turntable, shoot it at six angles as poses of a calibration (POST /calibration), and "
-            "POST /rig/turntable/axis"
+            "stand a board on the turntable and have it shot at six angles (POST /rig/turntable/shoot)"
         )
     if record.history and not record.history[-1].taken:
         last = record.history[-1]

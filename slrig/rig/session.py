@@ -136,7 +136,8 @@ class RigFacts:
     """What an open rig declares about itself: data that any thread may read.
 
     calibration : of the rig file, or of the head. positions : the poses that what moves the board can take, by name;
-    none where a person does. turntable : whether it turns what stands on it to any angle.
+    none where a person does. turntable : whether it turns what stands on it to any angle. axis : where its maker says
+    that it turns, in the frame of `calibration`; None where that is not known.
     """
 
     cameras: Mapping[str, CameraInfo]
@@ -144,6 +145,7 @@ class RigFacts:
     calibration: Calibration | None
     positions: tuple[str, ...] = ()
     turntable: bool = False
+    axis: RotationAxis | None = None
 
     @property
     def sizes(self) -> Mapping[str, Size]:
@@ -177,7 +179,8 @@ def driver_errors(rig: str) -> Iterator[None]:
 
 class RigSession:
     """A rig and the one thread that may touch it: all but `calls`, `facts`, `settings`, `fault`, `active`, `health`,
-    `calibration`, `misfit`, `refuse_misfit`, `use_calibration`, `give_up` and `darken_from_outside` belong to it.
+    `axis`, `calibration`, `misfit`, `refuse_misfit`, `use_calibration`, `give_up` and `darken_from_outside` belong to
+    it.
 
     `active` replaces the rig's own calibration for all that begins afterwards. One that is for other
     devices leaves the rig without any: the rig can still be calibrated, and a scan is refused.
@@ -227,6 +230,13 @@ class RigSession:
             self.fault = None
         active = self.active
         return self._rig if active is None else replace(self._rig, calibration=self._fitting(active))
+
+    @property
+    def axis(self) -> RotationAxis | None:
+        """The turntable's axis as the rig knows it by itself, in the frame of the calibration in use; None where that
+        is not the rig's own, or before the rig was open.
+        """
+        return None if self.facts is None or self.active is not None else self.facts.axis
 
     @property
     def calibration(self) -> Calibration | None:
@@ -363,4 +373,6 @@ class RigSession:
 def _facts(rig: Rig) -> RigFacts:
     cameras = {name: camera.info for name, camera in rig.cameras.items()}
     positions = () if rig.positioner is None else tuple(rig.positioner.poses)
-    return RigFacts(cameras, rig.projector.info, rig.calibration, positions, isinstance(rig.positioner, Turntable))
+    table = rig.positioner if isinstance(rig.positioner, Turntable) else None
+    axis = None if table is None else table.axis
+    return RigFacts(cameras, rig.projector.info, rig.calibration, positions, table is not None, axis)

@@ -137,6 +137,7 @@ def turntable_client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterato
         health=SimpleNamespace(health=lambda: (None, None, "the calibration in use")),
         store=SimpleNamespace(get=lambda *_: SimpleNamespace(state=JobState.SUCCEEDED)),
         worker=TameCompute(PIPELINE),
+        manager=SimpleNamespace(rig=SimpleNamespace(axis=None)),
     )
     monkeypatch.setattr(rig, "session_readings", lambda _: readings)
     monkeypatch.setattr(rig, "turntable_axis", found)
@@ -149,7 +150,7 @@ def turntable_client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterato
 def test_an_axis_and_planes_are_calibrated_kept_and_put_back(turntable_client: TestClient) -> None:
     before = turntable_client.get("/rig/turntable").json()
     assert before["state"] == "unknown"
-    assert "POST /rig/turntable/axis" in before["remedy"]
+    assert "POST /rig/turntable/shoot" in before["remedy"]
     asked = {"calibration": str(SESSION), "angles_deg": SIX_DEG.tolist()}
     calibrated = turntable_client.post("/rig/turntable/axis", json=asked).json()
     assert calibrated["state"] == "known"

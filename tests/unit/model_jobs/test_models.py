@@ -33,7 +33,7 @@ from slrig.jobs.records import RECORD, JobKind, JobProgress, JobRecord, JobState
 from slrig.jobs.resume import resume
 from slrig.jobs.retention import CLOCK, JobArchive, Limits, Retention, SteadyClock
 from slrig.jobs.store import Audit
-from slrig.model import MeasuredAxis, PlaneKind, TurntablePlane
+from slrig.model import MeasuredAxis, PlaneKind, RotationAxis, TurntablePlane
 from slrig.model_jobs.job import MODELS, ViewShooting
 from slrig.model_jobs.plan import (
     MEDIA_TYPES,
@@ -47,13 +47,15 @@ from slrig.model_jobs.plan import (
     plan_from_json,
     plan_json,
 )
+from slrig.rig.session import ActiveCalibration, RigFacts
 from slrig.scan.job import plan_from_json as scan_plan_from_json
 from slrig.scan.job import plan_json as scan_plan_json
 from slrig.scan.job import series
 from slrig.scan.plan import ScanPlan
+from tests.unit.calibrate.calibration_bench import tame_calibration
 from tests.unit.capture.fake_rig import FakeTurntable
 from tests.unit.model_jobs.model_bench import ModelBench, kept_scan, model_files, until_told
-from tests.unit.scan.fakes import WAIT_S
+from tests.unit.scan.fakes import WAIT_S, TameProjector
 
 AXIS = StatedAxis((4.0, 45.0, 12.0), (0.0, -1.0, 0.0))
 STILL = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -95,6 +97,20 @@ def test_the_axis_is_the_stages_own_unless_it_is_said(tmp_path: Path) -> None:
     for axis, expected in ((None, StatedAxis((1.0, 2.0, 3.0), (0.0, 0.0, 1.0))), (AXIS, AXIS)):
         plan = ModelPlan(scans, TurntablePoses(axis, (10.0, 55.0)))
         assert bench.models.settled(plan).poses == TurntablePoses(expected, (10.0, 55.0), of_turntable=axis is None)
+    bench.close()
+
+
+def test_where_no_axis_was_measured_the_rigs_own_counts_in_the_frame_of_its_own_calibration(tmp_path: Path) -> None:
+    bench = ModelBench(tmp_path, start=False)
+    own = RotationAxis(np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, 1.0]))
+    bench.manager.rig.facts = RigFacts({}, TameProjector().info, tame_calibration(), turntable=True, axis=own)
+    plan = ModelPlan(bench.kept_scans(0.0, 40.0))
+    assert bench.models.settled(plan).poses == TurntablePoses(
+        StatedAxis((1.0, 2.0, 3.0), (0.0, 0.0, 1.0)), (0.0, 40.0), of_turntable=True
+    )
+    bench.manager.rig.active = ActiveCalibration("spring", tame_calibration())
+    with pytest.raises(ConfigError, match="axis: expected that of the turntable"):
+        bench.models.settled(plan)
     bench.close()
 
 

@@ -29,7 +29,7 @@ def turntable(tmp_path: Path) -> TurntableStore:
 
 
 def test_models_improve_what_a_board_began(turntable: TurntableStore) -> None:
-    assert state_of(turntable.record())[0] is TurntableState.UNKNOWN
+    assert state_of(turntable.record(), None)[0] is TurntableState.UNKNOWN
     assert turntable.note(axis(), of="before any board") is None
     turntable.put_axis(axis(), source=AxisSource.BOARD, of="session", at=NOON)
     for number in range(1, 6):
@@ -40,7 +40,7 @@ def test_models_improve_what_a_board_began(turntable: TurntableStore) -> None:
     assert record.axis.point_sigma_mm < 0.008
     assert [each.source for each in record.history] == ["board"] + 5 * ["model"]
     assert record.history[1].moved_mm == pytest.approx(0.03)
-    assert state_of(record) == (TurntableState.KNOWN, "")
+    assert state_of(record, None) == (TurntableState.KNOWN, "")
 
 
 def test_moved_stage_is_reported_and_its_axis_kept(turntable: TurntableStore) -> None:
@@ -53,12 +53,12 @@ def test_moved_stage_is_reported_and_its_axis_kept(turntable: TurntableStore) ->
     assert record.axis is not None
     assert record.axis.point_mm[0] == 0.0
     assert record.planes[0].margin_mm == 1.2
-    state, remedy = state_of(record)
+    state, remedy = state_of(record, None)
     assert state is TurntableState.MOVED
     assert "model m turned about an axis that is 0.700 mm" in remedy
     assert "not taken" in turntable_svg(record.history)
     turntable.put_axis(axis(0.7), source=AxisSource.BOARD, of="again", at=NOON + timedelta(hours=2))
-    assert state_of(turntable.record())[0] is TurntableState.KNOWN
+    assert state_of(turntable.record(), None)[0] is TurntableState.KNOWN
 
 
 def test_what_is_written_is_read_again(turntable: TurntableStore, tmp_path: Path) -> None:
