@@ -11,7 +11,15 @@ from slrig.doctor.job import (
     last_examination,
 )
 from slrig.doctor.light import Severity
-from slrig.doctor.rig_file import known_stamp_errors_s, refuse_existing, toml_value, write_rig_file
+from slrig.doctor.rig_file import (
+    known_stamp_errors_s,
+    put_value,
+    refuse_existing,
+    toml_value,
+    with_diagnosis,
+    with_synchronisation,
+    write_rig_file,
+)
 
 __all__ = [
     "EXAMINATIONS",
@@ -27,7 +35,10 @@ __all__ = [
     "known_stamp_errors_s",
     "last_examination",
     "latency_from_document",
+    "put_value",
     "refuse_existing",
     "toml_value",
+    "with_diagnosis",
+    "with_synchronisation",
     "write_rig_file",
 ]

@@ -1,17 +1,19 @@
-"""Rig file with the values that an examination measured, each with a comment that gives the reason."""
+"""Rig file with the values that an examination measured, each with a comment that gives the reason.
+
+What a person wrote stays as it is written, comments and order too.
+"""
 
 from __future__ import annotations
 
-import copy
 import datetime
 import json
 import os
 import re
-import textwrap
-import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import tomlkit
 
 from slrig.bundle import read_text, write_durably
 from slrig.config import MAX_CONFIG_BYTES, read_rig
@@ -19,29 +21,30 @@ from slrig.devices import Synchronisation
 from slrig.disk import staging_name, storage_errors
 from slrig.doctor.advice import ExposureAdvice
 from slrig.doctor.doctor import Diagnosis
-from slrig.doctor.light import Severity, format_ms
+from slrig.doctor.light import format_ms
 from slrig.errors import ConfigError
 
-_WIDTH = 116
 _SYNC = "synchronisation"
 
 _LEAST_STAMP_ERROR_S = 1e-4
 """Smaller errors of time stamps make no difference between exposures."""
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
-KeyPath = tuple[str | int, ...]
-Comments = Mapping[KeyPath, str]
-
 
 def write_rig_file(diagnosis: Diagnosis, source: Path, target: Path, *, force: bool) -> None:
     """Write the rig file `source` to `target` with the measured exposures, lines and table [synchronisation].
 
-    All other values stay; paths relative to the one file become relative to the other. Comments are lost. Raises
-    ConfigError if the target exists and `force` is False; StorageError.
+    All other values stay; paths relative to the one file become relative to the other. Raises ConfigError if the target
+    exists and `force` is False; StorageError.
     """
     refuse_existing(target, force=force)
-    data = tomllib.loads(read_text(source, MAX_CONFIG_BYTES, ConfigError))
-    text = rig_file_text(data, diagnosis, source=source.resolve(), target=target.resolve())
+    text = read_text(source, MAX_CONFIG_BYTES, ConfigError)
+    old, new = source.resolve().parent, target.resolve().parent
+    if old != new:
+        tables = tomlkit.parse(text)
+        _rebase_paths(tables, old, new)
+        text = tomlkit.dumps(tables)
+    text = with_diagnosis(text, diagnosis)
     with storage_errors(target):
         staged = staging_name(target)
         try:
@@ -60,53 +63,76 @@ def refuse_existing(target: Path, *, force: bool) -> None:
         raise ConfigError(message)
 
 
-def rig_file_text(data: Mapping[str, Any], diagnosis: Diagnosis, *, source: Path, target: Path) -> str:
-    """Return the text of the new rig file. data : contents of the old one. source, target : absolute."""
-    tables = copy.deepcopy(dict(data))
-    if source.parent != target.parent:
-        tables = _rebase_paths(tables, source.parent, target.parent)
-    comments: dict[KeyPath, str] = {}
-    _set_exposures(tables, diagnosis.exposures, comments)
+def with_diagnosis(text: str, diagnosis: Diagnosis) -> str:
+    """The text of a rig file with what the doctor measured: exposures, lines, latency, period of the trigger."""
+    tables = tomlkit.parse(text)
+    _set_exposures(tables, diagnosis.exposures)
     lines = diagnosis.lines
-    table: dict[str, Any]
     if lines is not None:
-        table = tables.setdefault("scan", {})
+        table = _table(tables, "scan")
         # These belong to the old period; their defaults follow the new one.
         for key in () if lines.sines else ("line_width_px", "gray_cell_px"):
             table.pop(key, None)
-        table |= lines.options
-        comments["scan", next(iter(lines.options))] = f"{lines.reason}; {lines.gain_text} is expected"
-    measured = diagnosis.synchronisation
-    if measured is not None:
-        latency_s, error_s = round(measured.latency_s, 6), round(measured.latency_error_s, 6)
-        table = {"latency_s": latency_s, "latency_error_s": error_s}
-        comments |= {
-            (_SYNC, "latency_s"): "measured by flashes: mean delay of the light after the instant that the projector "
-            "states",
-            (_SYNC, "latency_error_s"): "and the longest further delay, beyond the error that the projector states; "
-            "scans wait for both",
-        }
-        if measured.earliest_s is not None:
-            table["earliest_s"] = round(measured.earliest_s, 6)
-            reason = "earliest instant of a change: with it, scans show the next pattern before the frames have arrived"
-            comments[_SYNC, "earliest_s"] = reason
-        if "trigger_period_s" in tables.get(_SYNC, {}):
-            table["trigger_period_s"] = tables[_SYNC]["trigger_period_s"]
-        if measured.line_time_s:
-            table["line_time_s"] = {name: round(seconds, 9) for name, seconds in measured.line_time_s.items()}
-            rolling = "measured: a rolling shutter exposes each row this much later than the row above it"
-            comments |= dict.fromkeys(((_SYNC, "line_time_s", name) for name in measured.line_time_s), rolling)
-        if errors_s := known_stamp_errors_s(measured):
-            table["stamp_error_s"] = errors_s
-            stamps = (
-                "of the time stamps meanwhile; at other exposures, frames keep the difference from changes of light"
-            )
-            comments |= dict.fromkeys(((_SYNC, "stamp_error_s", name) for name in errors_s), stamps)
-        tables[_SYNC] = table
+        words = f"{lines.reason}; {lines.gain_text} is expected"
+        for key, value in lines.options.items():
+            put_value(table, key, value, words)
+            words = ""
+    if diagnosis.synchronisation is not None:
+        _set_synchronisation(tables, diagnosis.synchronisation)
     if diagnosis.trigger_period_s is not None:
-        tables.setdefault(_SYNC, {})["trigger_period_s"] = round(diagnosis.trigger_period_s, 6)
-        comments[_SYNC, "trigger_period_s"] = "measured by wire: the least time between pulses that all cameras follow"
-    return "\n".join([*_heading(diagnosis, source), *_table_lines(tables, (), comments)]) + "\n"
+        words = "measured by wire: the least time between pulses that all cameras follow"
+        put_value(_table(tables, _SYNC), "trigger_period_s", round(diagnosis.trigger_period_s, 6), words)
+    return tomlkit.dumps(tables)
+
+
+def with_synchronisation(text: str, measured: Synchronisation) -> str:
+    """The text of a rig file with a measured latency."""
+    tables = tomlkit.parse(text)
+    _set_synchronisation(tables, measured)
+    return tomlkit.dumps(tables)
+
+
+def put_value(table: Any, key: str, value: float | bool | None, words: str = "") -> None:
+    """Set a value of a table, and why; one that is the same already keeps its words. value : None removes it."""
+    if value is None:
+        table.pop(key, None)
+    elif table.get(key) != value:
+        table[key] = value
+        if words:
+            table.item(key).comment(words)
+
+
+def _table(tables: Any, key: str) -> Any:
+    if key not in tables:
+        tables[key] = tomlkit.table()
+    return tables[key]
+
+
+def _set_synchronisation(tables: Any, measured: Synchronisation) -> None:
+    table = _table(tables, _SYNC)
+    words = "measured by flashes: mean delay of the light after the instant that the projector states"
+    put_value(table, "latency_s", round(measured.latency_s, 6), words)
+    words = "and the longest further delay, beyond the error that the projector states; scans wait for both"
+    put_value(table, "latency_error_s", round(measured.latency_error_s, 6), words)
+    words = "earliest instant of a change: with it, scans show the next pattern before the frames have arrived"
+    put_value(table, "earliest_s", None if measured.earliest_s is None else round(measured.earliest_s, 6), words)
+    words = "measured: a rolling shutter exposes each row this much later than the row above it"
+    line_time_s = {name: round(seconds, 9) for name, seconds in (measured.line_time_s or {}).items()}
+    _put_table(table, "line_time_s", line_time_s, words)
+    words = "of the time stamps meanwhile; at other exposures, frames keep the difference from changes of light"
+    _put_table(table, "stamp_error_s", known_stamp_errors_s(measured), words)
+
+
+def _put_table(table: Any, key: str, values: Mapping[str, float], words: str) -> None:
+    """Set a table within a table; without values there is none."""
+    if not values:
+        table.pop(key, None)
+        return
+    inner = _table(table, key)
+    for name in set(inner) - set(values):
+        inner.pop(name)
+    for name, value in values.items():
+        put_value(inner, name, value, words)
 
 
 def known_stamp_errors_s(measured: Synchronisation) -> dict[str, float]:
@@ -115,54 +141,30 @@ def known_stamp_errors_s(measured: Synchronisation) -> dict[str, float]:
     return {name: round(error_s, 6) for name, error_s in errors_s if error_s > _LEAST_STAMP_ERROR_S}
 
 
-def _set_exposures(
-    tables: dict[str, Any], exposures: Mapping[str, ExposureAdvice], comments: dict[KeyPath, str]
-) -> None:
+def _set_exposures(tables: Any, exposures: Mapping[str, ExposureAdvice]) -> None:
     """Write the exposure of each camera, or of a head, and remove the one of [scan], which would override them."""
     if not exposures:
         return
-    if isinstance(tables.get("scan"), dict):
+    if "scan" in tables:
         tables["scan"].pop("exposure_s", None)
-    advised: list[tuple[KeyPath, dict[str, Any], ExposureAdvice]] = [
-        (("camera", number), camera, exposures[camera["name"]])
-        for number, camera in enumerate(tables.get("camera", ()))
-        if camera["name"] in exposures
+    advised = [
+        (camera, exposures[camera["name"]]) for camera in tables.get("camera", ()) if camera["name"] in exposures
     ]
     if "head" in tables:
-        advised = [(("head",), tables["head"], min(exposures.values(), key=lambda each: each.exposure_s))]
-    for path, table, advice in advised:
+        advised = [(tables["head"], min(exposures.values(), key=lambda each: each.exposure_s))]
+    for table, advice in advised:
         shortest_s, longest_s = advice.usable_s
-        table["exposure_s"] = float(f"{advice.exposure_s:.6g}")
-        comments[(*path, "exposure_s")] = (
-            f"{advice.reason}; usable are {format_ms(shortest_s)} to {format_ms(longest_s)}"
-        )
+        words = f"{advice.reason}; usable are {format_ms(shortest_s)} to {format_ms(longest_s)}"
+        put_value(table, "exposure_s", float(f"{advice.exposure_s:.6g}"), words)
 
 
-def _heading(diagnosis: Diagnosis, source: Path) -> Iterator[str]:
-    yield from _comment(f"Written by slrig doctor, from {source.name}.")
-    if diagnosis.refresh_hz is not None:
-        yield from _comment(f"The display refreshes {diagnosis.refresh_hz:.2f} times a second.")
-    if diagnosis.response is not None:
-        yield from _comment(f"Light grows with the grey value to the power of {diagnosis.response.gamma:.2f}.")
-    for severity in (Severity.FAULT, Severity.NOTE):
-        for finding in diagnosis.with_severity(severity):
-            yield from _comment(f"{severity.capitalize()}, {finding.subject}: {finding.found}. Do: {finding.remedy}.")
-    yield ""
-
-
-def _comment(text: str) -> list[str]:
-    return textwrap.wrap(" ".join(text.split()), _WIDTH, initial_indent="# ", subsequent_indent="#   ")
-
-
-def _rebase_paths(value: Any, old: Path, new: Path) -> Any:
-    """Return the value with every text that names a file or folder relative to `old` made relative to `new`."""
-    if isinstance(value, Mapping):
-        return {key: _rebase_paths(each, old, new) for key, each in value.items()}
-    if isinstance(value, list):
-        return [_rebase_paths(each, old, new) for each in value]
-    if isinstance(value, str) and value and not Path(value).is_absolute() and _exists(old / value):
-        return Path(os.path.relpath((old / value).resolve(), new)).as_posix()
-    return value
+def _rebase_paths(table: Any, old: Path, new: Path) -> None:
+    """Make every text that names a file or folder relative to `old` relative to `new`, in tables and lists too."""
+    for key, value in table.items() if isinstance(table, Mapping) else enumerate(table):
+        if isinstance(value, Mapping | list):
+            _rebase_paths(value, old, new)
+        elif isinstance(value, str) and value and not Path(value).is_absolute() and _exists(old / value):
+            table[key] = Path(os.path.relpath((old / value).resolve(), new)).as_posix()
 
 
 def _exists(path: Path) -> bool:
@@ -170,30 +172,6 @@ def _exists(path: Path) -> bool:
         return path.exists()
     except (OSError, ValueError):
         return False
-
-
-def _table_lines(table: Mapping[str, Any], path: KeyPath, comments: Comments) -> Iterator[str]:
-    """Yield the lines of a table: its values, then its tables, then its arrays of tables."""
-    for key, value in table.items():
-        if not _is_table(value):
-            if (*path, key) in comments:
-                yield from _comment(comments[(*path, key)])
-            yield f"{_format_key(key)} = {toml_value(value)}"
-    for key, value in table.items():
-        if not _is_table(value):
-            continue
-        for number, each in enumerate(value if isinstance(value, list) else [value]):
-            inner: KeyPath = (*path, key, number) if isinstance(value, list) else (*path, key)
-            name = ".".join(_format_key(step) for step in inner if isinstance(step, str))
-            yield ""
-            yield f"[[{name}]]" if isinstance(value, list) else f"[{name}]"
-            yield from _table_lines(each, inner, comments)
-
-
-def _is_table(value: Any) -> bool:
-    if isinstance(value, list):
-        return bool(value) and all(isinstance(each, Mapping) for each in value)
-    return isinstance(value, Mapping)
 
 
 def _format_key(key: str) -> str:

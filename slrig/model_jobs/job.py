@@ -181,7 +181,8 @@ def turntable_planes(mesh: Path, axis: MeasuredAxis | None) -> tuple[TurntablePl
 class Models:
     """Has models made: the `Group` of models. Any thread may call.
 
-    turntable : knows its axis and planes, and learns of each model's axis; without an axis, the rig's own counts. spare_bytes : left free on the disk.
+    turntable : knows its axis and planes, and learns of each model's axis; without an axis, the rig's own counts.
+    spare_bytes : left free on the disk.
     """
 
     def __init__(self, manager: JobManager, *, turntable: TurntableStore, spare_bytes: int = 0) -> None:

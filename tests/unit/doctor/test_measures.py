@@ -350,7 +350,7 @@ def test_a_remedy_belongs_to_faults_and_notes_only() -> None:
 
 
 OLD = """
-# A comment that is not kept.
+# A comment of a person.
 name = "bench \\u007f \\"two\\""
 calibration = "calibrations/bench.json"
 
@@ -437,16 +437,18 @@ def test_the_new_file_is_the_old_one_with_the_measured_values(old: Path) -> None
     assert read.synchronisation is not None
     assert read.cameras[0].exposure_s == 0.0166667
     assert read.calibration == old.parent / "calibrations" / "bench.json"
-    # Every value has a comment that says why.
+    # Every value has a comment that says why, and what a person wrote is as it was.
     lines = new.read_text().splitlines()
-    for key, words in (
-        ("exposure_s = 0.0166667", "# 1 × the refresh period; usable are 2 ms to 30 ms"),
-        ("latency_s = 0.041235", "# measured by flashes"),
-        ("latency_error_s = 0.0031", "# and the longest further delay"),
+    for value in (
+        "exposure_s = 0.0166667 # 1 × the refresh period; usable are 2 ms to 30 ms",
+        "latency_s = 0.041235 # measured by flashes",
+        "latency_error_s = 0.0031 # and the longest further delay",
     ):
-        assert lines[lines.index(key) - 1].startswith(words)
-    assert lines[0] == "# Written by slrig doctor, from old.toml."
-    assert "# Fault, projector: light comes late, by far. Do: write it down." in lines
+        assert any(line.startswith(value) for line in lines)
+    assert [line for line in OLD.splitlines() if line not in lines] == ["exposure_s = 0.5", "exposure_s = 0.25"]
+    # What was measured once more, the same, changes nothing.
+    write_rig_file(diagnosis(synchronisation=measured), new, old, force=True)
+    assert old.read_text() == new.read_text()
 
 
 def test_a_measured_period_of_the_trigger_is_written_without_a_latency(old: Path) -> None:
@@ -463,8 +465,7 @@ def test_lines_that_suit_the_blur_take_the_place_of_those_there(old: Path) -> No
     new = old.with_name("new.toml")
     write_rig_file(diagnosis(lines=advice), old, new, force=False)
     assert tomllib.loads(new.read_text())["scan"] == {"line_shift_period_px": 24, "line_steps": 8}
-    comment = " ".join(new.read_text().partition("[scan]")[2].partition("line_shift_period_px")[0].split())
-    assert "bars are blurred by 3.5 projector pixels" in comment
+    assert "line_shift_period_px = 24 # measured: bars are blurred by 3.5 projector pixels" in new.read_text()
 
 
 def test_sinusoids_that_suit_the_blur_leave_lines_as_they_are(old: Path) -> None:
