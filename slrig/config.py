@@ -23,6 +23,8 @@ from slrig.bundle import (
     Strict,
     describe_errors,
     embed_masks,
+    parse_toml,
+    read_text,
     read_toml,
     validate,
 )
@@ -171,14 +173,14 @@ class RigTable(Strict):
 
 @dataclass(frozen=True, slots=True)
 class RigConfig:
-    """A validated rig file. `folder` is its folder: paths in it are relative to that folder.
+    """A validated rig file. path : absolute; paths in it are relative to its folder.
 
     Either `head` is given, or `projector` and `cameras`. positioner : moves the object; None if the head has one or
     there is none.
     """
 
     name: str
-    folder: Path
+    path: Path
     calibration: Path | None
     head: HeadTable | None
     projector: DriverTable | None
@@ -190,13 +192,22 @@ class RigConfig:
     presets: Mapping[str, Preset] = field(default_factory=dict)
     positioner: DriverTable | None = None
 
+    @property
+    def folder(self) -> Path:
+        """The folder of the file."""
+        return self.path.parent
+
 
 def read_rig(path: Path) -> RigConfig:
-    """Return the rig that a TOML file describes.
-    Raises ConfigError: the file is missing or not TOML, or any of its keys is unknown or wrong; all faults in one
-    message.
+    """Return the rig that a TOML file describes. Raises ConfigError: the file is missing; or see `rig_of`."""
+    return rig_of(read_text(path, MAX_CONFIG_BYTES, ConfigError), path)
+
+
+def rig_of(text: str, path: Path) -> RigConfig:
+    """Return the rig that the text of a TOML file describes. path : of the file, which need not exist.
+    Raises ConfigError: it is not TOML, or any of its keys is unknown or wrong; all faults in one message.
     """
-    data = read_toml(path, MAX_CONFIG_BYTES)
+    data = parse_toml(text, path)
     presets = data.get("presets")
     preset_names = [(presets, name) for name in presets] if isinstance(presets, dict) else []
     for tables, name in [(data, "scan"), *preset_names]:
@@ -211,11 +222,11 @@ def parse_rig(data: Mapping[str, Any], path: Path) -> RigConfig:
     Raises ConfigError: any key is unknown or wrong; all faults in one message.
     """
     table = validate(RigTable, data, f"the rig file {path}")
-    folder = path.resolve().parent
+    path = path.resolve()
     return RigConfig(
         name=table.name,
-        folder=folder,
-        calibration=None if table.calibration is None else folder / table.calibration,
+        path=path,
+        calibration=None if table.calibration is None else path.parent / table.calibration,
         head=table.head,
         projector=table.projector,
         cameras=tuple(table.camera),

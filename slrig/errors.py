@@ -219,6 +219,10 @@ class ScanStateError(SlrigError, code="scan-state"):
     """The scan exists, but its state forbids the call: deleting one that runs, for example."""
 
 
+class RigFileChangedError(SlrigError, code="rig-file-changed"):
+    """The rig file is not the one that a change was made of: somebody else changed it meanwhile. Nothing is lost."""
+
+
 class IdempotencyError(SlrigError, code="idempotency"):
     """An idempotency key was used again with another request body, or while the first request is in progress."""
 

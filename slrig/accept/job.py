@@ -281,7 +281,7 @@ class AcceptanceTests:
         """tolerance_mm : what a point may be wrong by in what the rig is for, by the rig file."""
         self._manager = manager
         self._store = AcceptanceStore(manager.data)
-        self._clock, self._wanted_mm = clock, tolerance_mm
+        self._clock, self.tolerance_mm = clock, tolerance_mm
         self._lock = threading.RLock()
         self._tests = {record.id: record for record in self._store.load()}
         # Of those that are measured by script in this run of the service.
@@ -311,7 +311,7 @@ class AcceptanceTests:
                 message = f"rig '{rig.name}' has no calibration, and nothing can be measured; calibrate it first"
                 raise CalibrationError(message)
             number = 1 + max((each.number for each in self._tests.values()), default=0)
-            plan = plan_of(calibration, self._wanted_mm)
+            plan = plan_of(calibration, self.tolerance_mm)
             record = AcceptanceRecord(number, uuid4(), self._clock(), rig.name, calibration.solve_id, plan)
             self._store.save(record)
             write_calibration(self._store.folder(record.id) / CALIBRATION, calibration)

@@ -19,7 +19,20 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from slrig.api import acceptance, auth, calibration, events, files, models, notices, rig, scans, schedules, system
+from slrig.api import (
+    acceptance,
+    auth,
+    calibration,
+    events,
+    files,
+    models,
+    notices,
+    rig,
+    rig_file,
+    scans,
+    schedules,
+    system,
+)
 from slrig.api.auth import LOCAL_NAMES, Access, BodyLimits, KeyRing, SecurityHeaders, Sessions
 from slrig.api.calibration import IMPORT_PATH, MOST_IMPORT_BYTES
 from slrig.api.problems import PlainErrorsToProblems, answer, describe, install_problems, problem
@@ -126,6 +139,7 @@ def bare_app() -> FastAPI:
         scans.exposure_router,
         rig.router,
         rig.examination_router,
+        rig_file.router,
         calibration.router,
         rig.health_router,
         rig.turntable_router,

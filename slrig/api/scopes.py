@@ -28,14 +28,23 @@ _SCOPES = {
 }
 
 
+RIG_FILE = ("/rig/file", "/rig/settings")
+"""Its options may hold a password, and name files and programs."""
+
+
 def needed_scope(method: str, path: str) -> KeyScope:
-    """What a key must be for to send this request: reading is looking, but for a preview, which takes the rig.
+    """What a key must be for to send this request: reading is looking, but for a preview, which takes the rig, and for
+    the rig file.
 
     >>> [str(needed_scope("GET", path)) for path in ("/scan", "/preview/left", "/audit")]
     ['look', 'scan', 'administer']
     >>> [str(needed_scope("POST", path)) for path in ("/scan", "/rig/verification", "/schedule")]
     ['scan', 'calibrate', 'administer']
+    >>> [str(needed_scope(method, "/rig/file")) for method in ("GET", "PUT")]
+    ['administer', 'administer']
     """
+    if path in RIG_FILE:
+        return KeyScope.ADMINISTER
     room = path.split("/")[1] if "/" in path else ""
     if moves(method, path):
         return KeyScope.SCAN if room == "preview" else _SCOPES.get(room, KeyScope.ADMINISTER)

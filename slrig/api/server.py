@@ -364,14 +364,7 @@ def open_service(
             spare_bytes=settings.min_free_bytes,
             give_up=give_up,
         )
-        return Service(
-            settings,
-            rig.scan,
-            manager,
-            refuse_when_stale=rig.refuse_when_stale,
-            tolerance_mm=rig.tolerance_mm,
-            presets=rig.presets,
-        )
+        return Service(settings, rig, manager)
     except BaseException:
         database.close()
         folder.release()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -21,11 +21,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from slrig.accept.job import AcceptanceTests
 from slrig.api.shares import Makings, Shares
-from slrig.bundle import Preset, ScanDefaults
 from slrig.calibrate.job import CalibrationArchive, Calibrations
 from slrig.calibrate.verification import RigHealth
 from slrig.catalogue.store import Copier, catalogue_of, standing
-from slrig.config import ServiceSettings
+from slrig.config import RigConfig, ServiceSettings
 from slrig.discovery import DeviceSearch
 from slrig.doctor import EXAMINATIONS, Examinations
 from slrig.failure import LastingThread
@@ -159,9 +158,7 @@ _SCHEDULE_END_S = 1.0
 class Service:
     """One service: its settings, its jobs, what these belong to, and the schedule.
 
-    Until `start` nothing works. followed : what streams follow, see `slrig.api.events.told`. refuse_when_stale :
-    whether the rig file has scans refused then. tolerance_mm : what it wants of a point's error. presets : the rig
-    file's.
+    Until `start` nothing works. followed : what streams follow, see `slrig.api.events.told`. rig : its rig file.
 
     Raises
     ------
@@ -174,22 +171,10 @@ class Service:
         The catalogue's driver is not installed.
     """
 
-    def __init__(
-        self,
-        settings: ServiceSettings,
-        scan_defaults: ScanDefaults,
-        manager: JobManager,
-        *,
-        refuse_when_stale: bool = False,
-        tolerance_mm: float | None = None,
-        presets: Mapping[str, Preset] | None = None,
-    ) -> None:
+    def __init__(self, settings: ServiceSettings, rig: RigConfig, manager: JobManager) -> None:
         self.settings = settings
-        self.scan_defaults = scan_defaults
         self.manager = manager
         self.store, self.folder, self.worker = manager.store, manager.data, manager.worker
-        self.presets = Presets(self.folder.root / "presets", presets or {})
-        self.refuse_when_stale = refuse_when_stale
         self.hurry = threading.Event()
         self.devices = DeviceSearch()
         close = "Close one, or ask for single answers instead, as GET /scan/ID."
@@ -212,11 +197,12 @@ class Service:
         self.keys = RequestKeys(database, clock=clock.now, life_s=settings.idempotency_keep_s)
         self.keys.release_all()
         self.audit = Audit(database)
-        self.calibrations = Calibrations(manager, tolerance_mm=tolerance_mm)
+        self.calibrations = Calibrations(manager)
         self.health = RigHealth(manager.rig, NoticedHealth(database, outbox), self.folder)
         manager.groups.update(dict.fromkeys((JobKind.SCAN, JobKind.VERIFICATION), self.health))
         manager.groups.update(dict.fromkeys(EXAMINATIONS, Examinations(self.folder.root)))
-        self.acceptance = AcceptanceTests(manager, tolerance_mm=tolerance_mm)
+        self.acceptance = AcceptanceTests(manager)
+        self.use(rig)
         self.turntable = TurntableStore(self.folder.root / TURNTABLE)
         spare_bytes = settings.min_free_bytes
         manager.groups[JobKind.AXIS] = self.turntable
@@ -261,6 +247,13 @@ class Service:
         )
         # The folder's lock keeps every other process out.
         self.scheduler = Scheduler(self.schedules, self.tasks, alone=True)
+
+    def use(self, rig: RigConfig) -> None:
+        """Have what is begun from now on go by a rig file: usual options of scans, presets, tolerance."""
+        self.rig = rig
+        self.scan_defaults, self.refuse_when_stale = rig.scan, rig.refuse_when_stale
+        self.presets = Presets(self.folder.root / "presets", rig.presets)
+        self.calibrations.tolerance_mm = self.acceptance.tolerance_mm = rig.tolerance_mm
 
     def delete_scan(self, scan_id: UUID) -> None:
         """Remove a finished scan: its record, its events, its files. Raises JobNotFoundError; ScanStateError: it is not

@@ -172,8 +172,12 @@ def read_json(text: str, source: Path, error: type[InvalidInputError]) -> Any:
 
 
 def read_toml(path: Path, max_bytes: int) -> dict[str, Any]:
-    """Return the tables of a TOML file. Raises ConfigError: see `read_text`; or with the line of the fault."""
-    text = read_text(path, max_bytes, ConfigError)
+    """Return the tables of a TOML file. Raises ConfigError: see `read_text` and `parse_toml`."""
+    return parse_toml(read_text(path, max_bytes, ConfigError), path)
+
+
+def parse_toml(text: str, path: Path) -> dict[str, Any]:
+    """Return the tables of a TOML text. path : of its file. Raises ConfigError with the line of the fault."""
     try:
         return tomllib.loads(text)
     except RecursionError as cause:

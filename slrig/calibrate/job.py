@@ -410,7 +410,7 @@ class Calibrations:
         self.store = CalibrationStore(manager.data)
         self.register = CalibrationRegister(self.store, manager.store)
         self._manager = manager
-        self._tolerance_mm = tolerance_mm
+        self.tolerance_mm = tolerance_mm
         self._last_frame_s: dict[UUID, float] = {}
         manager.groups.update(dict.fromkeys((JobKind.POSE, JobKind.SOLVE), self))
         manager.rig.use_calibration(self.store.active_calibration())
@@ -573,7 +573,7 @@ class Calibrations:
                 compared.unlink(missing_ok=True)
             if used is not None:
                 write_calibration(compared, used)
-            self._manager.submit(SolveJob(session_id, record.solve + 1, board_shape, self._tolerance_mm))
+            self._manager.submit(SolveJob(session_id, record.solve + 1, board_shape, self.tolerance_mm))
             return self.register.get(session_id)
 
     def _comparable(self, record: SessionRecord) -> Calibration | None:

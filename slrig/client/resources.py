@@ -282,6 +282,33 @@ class RigState(Resource):
         """The installed drivers, the devices that are plugged in, and the missing libraries."""
         return self._connection.json("GET", "/device")
 
+    def get_file(self) -> Json:
+        """The rig file, its settings, and `proposals` of the last examinations. Needs the scope administer."""
+        return self._connection.json("GET", "/rig/file")
+
+    def put_file(self, text: str, *, version: str) -> Json:
+        """Have the rig opened by another text of its file, and that kept. version : of the file that it was made of."""
+        return self._connection.json("PUT", "/rig/file", json={"text": text, "version": version})
+
+    def put_settings(
+        self,
+        cameras: Mapping[str, Mapping[str, float | None]],
+        *,
+        version: str,
+        tolerance_mm: float | None = None,
+        refuse_when_stale: bool | None = None,
+    ) -> Json:
+        """Change exposures and gains, and what is wanted of scans, in the rig file, and open the rig by it.
+
+        cameras : `exposure_s` and `gain` by name. version : of the file that is changed.
+        """
+        options = given(tolerance_mm=tolerance_mm, refuse_when_stale=refuse_when_stale)
+        return self._connection.json("PUT", "/rig/settings", json={"cameras": cameras, "version": version, **options})
+
+    def reopen(self) -> None:
+        """Close every device, and open the rig by its file as it is now."""
+        self._connection.send("POST", "/rig/reopen")
+
     def pictures(
         self, camera: str, *, light: Literal["off", "white"] | None = None, marks: bool | None = None
     ) -> Iterator[Picture]:

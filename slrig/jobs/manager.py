@@ -250,10 +250,10 @@ class JobManager:
         return records
 
     def lend(self, holder: Holder, use: Callable[[RigSession, Callable[[], bool]], _Result]) -> _Result:
-        """Have the open rig used on its thread for some seconds, now or not at all, and return what came of it.
+        """Have the rig used on its thread for some seconds, now or not at all, and return what came of it.
 
-        use : is given the rig, and whether it is to end early. Nothing is on record. Raises what that raises, and
-        RigBusyError and DeviceError as `submit`.
+        use : is given the rig, to be opened, and whether it is to end early. Nothing is on record. Raises what that
+        raises, and RigBusyError and DeviceError as `submit`.
         """
         loan = _Loan(uuid4(), _NoJob(), holder, utc_now(), resumable=False, use=use)
         with self._changed:
@@ -596,7 +596,6 @@ class JobManager:
         if isinstance(work, _Loan):
             try:
                 with driver_errors(rig.name):
-                    rig.open()
                     work.result = work.use(rig, work.stop.is_set)
             except Exception as error:
                 rig.doubt(error)

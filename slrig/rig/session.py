@@ -309,6 +309,21 @@ class RigSession:
         self._bare = self._opened()
         return self._bare
 
+    def reopen(self, open_rig: Callable[[], Rig], kept: Callable[[], None]) -> None:
+        """Close every device, and open the rig by `open_rig` from now on. kept : called when it is open. The rig is
+        opened as before where either fails. Raises what they raise.
+        """
+        before, self._open_rig = self._open_rig, open_rig
+        self.let_go()
+        try:
+            self.open()
+            kept()
+        except BaseException:
+            self._open_rig = before
+            self.let_go()
+            self.try_open()
+            raise
+
     def try_open(self) -> Exception | None:
         """Open the rig, or return why it cannot be opened, which `fault` keeps. The next scan tries again."""
         try:

@@ -585,7 +585,7 @@ class Tasks:
         try:
             if self._manager.rig.facts is None:
                 # What it can do is known only when it is open.
-                self._manager.lend(holder, lambda _rig, _cancelled: None)
+                self._manager.lend(holder, lambda rig, _cancelled: rig.open())
             return task.do(holder, checked(task.options, order.options, task=order.task), stop=stop)
         finally:
             with self._lock:

@@ -19,10 +19,9 @@ from slrig.api.auth import KeyRing
 from slrig.api.problems import install_problems
 from slrig.api.server import KINDS
 from slrig.api.service import Service, _of_request
-from slrig.bundle.options import ScanDefaults
 from slrig.cli.options import ServiceOptions
 from slrig.client import Client
-from slrig.config import ServiceSettings
+from slrig.config import ServiceSettings, rig_of
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.manager import JobManager
@@ -39,6 +38,14 @@ from tests.unit.stand_ins import stand_ins
 
 KEY = "the key of the tests"
 HERE = "http://127.0.0.1"
+RIG = """# A bench.
+name = "bench"
+[head]
+driver = "tame" # as tests open it
+[scan]
+line_shift_period_px = 6
+exposure_s = 0.5
+"""
 
 
 class ServedBench(TameBench):
@@ -70,7 +77,7 @@ class ServedBench(TameBench):
         self.unpatch = patched.close
         rig = RigSession("bench", self.open_rig)
         manager = JobManager(store, folder, rig, self.worker, *KINDS, queue_length=1)
-        self.service = Service(chosen, ScanDefaults(line_shift_period_px=6, exposure_s=0.5), manager)
+        self.service = Service(chosen, rig_of(RIG, root / "rig.toml"), manager)
         self.app: FastAPI = create_app(self.service, ring=KeyRing(root / "keys.json", given=KEY))
 
     def held(self, client: TestClient) -> dict[str, Any]:
