@@ -65,7 +65,8 @@ export function readMesh(buffer) {
 }
 
 /**
- * Where a ray first meets the mesh (Möller and Trumbore 1997, "Fast, minimum storage ray/triangle intersection"): {distance, pointMm, sigmaMm}, or null.
+ * Where a ray first meets the mesh (Möller and Trumbore 1997, "Fast, minimum storage ray/triangle intersection"): {distance, pointMm, sigmaMm, corner: the
+ * first of the triangle's}, or null.
  * `from` and `along` are in stored positions. All triangles are tried: 1.7 million take some 50 ms, and no tree has to be kept.
  */
 export function firstHit(mesh, from, along) {
@@ -97,7 +98,7 @@ export function firstHit(mesh, from, along) {
   }
   if (!found) return null;
   const pointMm = mesh.originMm.map((origin, axis) => origin + mesh.stepMm * (from[axis] + best * along[axis]));
-  return {distance: best, pointMm, sigmaMm: sigmaAt(mesh, ...found)};
+  return {distance: best, pointMm, sigmaMm: sigmaAt(mesh, ...found), corner: found[0]};
 }
 
 /** The standard deviation within the triangle whose corners begin at `corner`, mm; NaN where one of theirs is not known. */
