@@ -1,13 +1,23 @@
-// The mesh view with what belongs to it: how it is coloured, its legend, the distances measured on it.
+// A mesh in the workspace: how it is coloured and drawn, its legend, what is measured on it, and the point that a picture beside it shows.
 import {html, useEffect, useRef, useState} from "./vendor/preact-htm.js";
+import {useTold} from "./colours.js";
 import {fetchMesh} from "./glb.js";
-import {Action, Choice, Refusal, count, length, percent} from "./ui.js";
+import {MeasureBar, Marks, Measured, useMeasuring} from "./measuring.js";
+import {Action, Choice, Refusal, count, percent} from "./ui.js";
+import {Panel, Workspace} from "./workspace.js";
 
-const WORDS = [["shaded", "Shaded"], ["albedo", "Albedo"], ["sigma", "σ"], ["stripe", "Stripe"]];
+const COLOURS = [
+  ["shaded", "Shaded"], ["albedo", "Albedo"], ["depth", "Depth"], ["sigma", "σ"], ["stripe", "Stripe"], ["cause", "Cause"], ["views", "Views"], ["deviation", "Deviation"],
+];
+const FORMS = [["surface", "Surface"], ["points", "Points"], ["wires", "Wires"]];
 const SIGMA_STEP_MM = 1e-4;
 /** Of this scan and of the one beside it; told apart by the colour-blind, too. */
 const PLAIN = ["#b9c2c8", "#e69f00"];
 const TURN_DEG = 10;
+/** A kind of which there is less is not in the legend. */
+const LEAST_SHARE = 1e-4;
+/** A pointer that rests for so long is asked what it points at. */
+const REST_MS = 40;
 
 /** The part that draws is large: whoever will need it has it loaded before there is something to draw. */
 let drawing = null;
@@ -17,27 +27,26 @@ export const loadDrawing = () => {
 };
 
 /**
- * `scan`: a scan, or a model of several, which is `merged` and has no stripes. `other`: a scan shown in the same view, or null. `report` may come later.
- * `again` takes the box of what is seen, or is null.
+ * `scan`: a scan, or a model of several, which is `merged` and has no stripes. `other`: a scan shown in the same view, or null. `report` and `calibration` may come later.
+ * `again` takes the box of what is seen, or is null. `over` stands over the middle of the stage. `pointed`: {mm}, a point that is pointed at, or {fromMm, along}, the ray
+ * of a picture's pixel; `point` takes one. `head` and `children` stand beside the stage.
  */
-export function Mesh({scan, other, report, again}) {
+export function Mesh({scan, other = null, report, calibration = null, again, over, pointed = null, point, head, children}) {
   const canvas = useRef();
   const [view, setView] = useState(null);
-  const [scale, setScale] = useState("");
+  const [styles, setStyles] = useState({});
   const [, setDrawn] = useState(0);
   const [problem, setProblem] = useState(null);
-  const [mode, setMode] = useState("shaded");
-  const [wanted, setShown] = useState([true, true]);
-  const shown = other ? wanted : [true, true];
-  const [measuring, setMeasuring] = useState(false);
-  const [points, setPoints] = useState([]);
+  const [wanted, setMode] = useState("shaded");
+  const [form, setForm] = useState("surface");
+  const [both, setShown] = useState([true, true]);
   useEffect(() => {
     let made = null;
     let left = false;
-    loadDrawing().then(({View, SCALE_CSS}) => {
+    loadDrawing().then(({View, SCALE_CSS, SIGNED_CSS, BACK_CSS}) => {
       if (left) return;
       made = new View(canvas.current, () => setDrawn((before) => before + 1));
-      setScale(SCALE_CSS);
+      setStyles({scale: SCALE_CSS, signed: SIGNED_CSS, back: BACK_CSS});
       setView(made);
     }).catch(() => setProblem({document: {title: "No 3-D here"}, message: "The browser has no WebGL 2, or it is switched off. The files can be downloaded all the same."}));
     return () => {
@@ -45,58 +54,77 @@ export function Mesh({scan, other, report, again}) {
       made?.dispose();
     };
   }, []);
-  const mine = useLevels(view, 0, scan, setProblem);
-  const theirs = useLevels(view, 1, other, setProblem);
-  const sigma = scan.summary?.mesh?.sigma_mm;
-  const axis = report?.axis === "row" ? 1 : 0;
-  const ranges = {sigma: sigma ? [sigma.p5, sigma.p95].map((mm) => mm / SIGMA_STEP_MM) : [0, 1], stripe: [0, report?.frames.projector_px[axis] ?? 1]};
-  const range = ranges[mode] ?? [0, 1];
-  useEffect(() => view?.set(mode, range[1] > range[0] ? range : [range[0], range[0] + 1], shown), [view, mode, ...range, ...shown]);
+  const [mine, meshes] = useLevels(view, 0, scan, setProblem);
+  const [theirs, others] = useLevels(view, 1, other, setProblem);
+  const told = useTold({scan, report, calibration, mesh: meshes.full ?? null, other: others.full ?? null, mode: wanted});
+  const offered = COLOURS.filter(([name]) => told.offers(name));
+  const mode = told.offers(wanted) ? wanted : "shaded";
+  // Of the other scan these are not known, and it would hide this one.
+  const alone = ["cause", "views", "deviation"].includes(mode);
+  const shown = !other ? [true, true] : alone ? [true, false] : both;
+  const range = useRange(mode, scan, report, meshes.coarse, told);
+  useEffect(() => {
+    if (told.values && view) view.tell(meshes.full, told.values);
+  }, [view, told.values]);
+  useEffect(() => view?.set(mode, form, range, told.kinds.map(({colour}) => colour), shown), [view, mode, form, ...range, told.kinds, ...shown]);
   useEffect(() => view?.limit(scan.plan?.reconstruction?.region?.box_mm), [view, scan.id]);
-  const take = (x, y) => {
-    const hit = view.pick(x, y);
-    if (hit) setPoints((before) => [...before, hit]);
-  };
+  const measuring = useMeasuring(view);
+  const ready = view !== null && meshes.full !== undefined;
+  const take = (x, y) => measuring.take(view.pick(x, y));
   const looked = useRef();
-  looked.current = measuring ? take : null;
+  looked.current = measuring.on && ready ? take : null;
   useEffect(() => view?.clicks((x, y) => looked.current?.(x, y)), [view]);
+  const resting = useRef();
+  const rest = (event) => {
+    clearTimeout(resting.current);
+    const {offsetX: x, offsetY: y, buttons} = event;
+    if (point && ready && buttons === 0) resting.current = setTimeout(() => point(hitOf(view.pick(x, y))), REST_MS);
+  };
+  const leave = () => {
+    clearTimeout(resting.current);
+    point?.(null);
+  };
+  useEffect(() => () => clearTimeout(resting.current), []);
+  const [spot, setSpot] = useState(null);
+  useEffect(() => setSpot(ready && pointed?.along ? view.seenFrom(pointed.fromMm, pointed.along)?.pointMm ?? null : null), [ready, pointed]);
   const swap = () => setShown((before) => before[0] && before[1] ? [true, false] : [before[1], before[0]]);
-  const keys = {
-    ArrowLeft: () => view.turn(TURN_DEG, 0), ArrowRight: () => view.turn(-TURN_DEG, 0), ArrowUp: () => view.turn(0, TURN_DEG), ArrowDown: () => view.turn(0, -TURN_DEG),
-    "+": () => view.closer(1.25), "-": () => view.closer(0.8), f: () => view.fit(), r: () => view.front(), b: () => other && swap(),
-    Enter: () => measuring && take(canvas.current.clientWidth / 2, canvas.current.clientHeight / 2),
-  };
-  const pressed = (event) => {
-    if (!view || event.ctrlKey || event.metaKey || event.altKey || !keys[event.key]) return;
-    event.preventDefault();
-    keys[event.key]();
-  };
-  const cameras = Object.entries(report?.cameras ?? {}).filter(([, told]) => told.rotation);
-  const pairs = [];
-  for (let at = 0; at + 1 < points.length; at += 2) pairs.push(points.slice(at, at + 2));
-  return html`<${Refusal} problem=${problem} />
-    <div class="row">
-      <${Choice} label="Colours" value=${mode} options=${WORDS.filter(([name]) => name !== "stripe" || !scan.merged)} chosen=${setMode} />
-      <${Action} aria-pressed=${measuring} disabled=${!view} onClick=${() => setMeasuring(!measuring)}>Measure<//>
+  const cameras = Object.entries(report?.cameras ?? {}).filter(([, camera]) => camera.rotation);
+  const toggled = (name) => setForm(form === name ? "surface" : name);
+  const keys = view ? [
+    ["ArrowLeft", "Turn", () => view.turn(TURN_DEG, 0)], ["ArrowRight", "Turn", () => view.turn(-TURN_DEG, 0)], ["ArrowUp", "Turn", () => view.turn(0, TURN_DEG)],
+    ["ArrowDown", "Turn", () => view.turn(0, -TURN_DEG)], ["+", "Nearer", () => view.closer(1.25)], ["-", "Further", () => view.closer(0.8)], ["f", "Fit to the window", () => view.fit()],
+    ["r", "From the front", () => view.front()], ...cameras.map(([name, camera], at) => [`${at + 1}`, `From camera ${name}`, () => view.from(camera)]),
+    ["c", "Next colours", () => setMode(offered[(offered.findIndex(([name]) => name === mode) + 1) % offered.length][0])],
+    ["p", "Points, or the surface again", () => toggled("points")], ["w", "Wires, or the surface again", () => toggled("wires")], ["m", "Measure, or stop measuring", measuring.toggle],
+    ["Enter", "Measure at the middle", () => measuring.on && ready && take(canvas.current.clientWidth / 2, canvas.current.clientHeight / 2)],
+    ["Backspace", "Remove the last measurement", measuring.back], ["Escape", "Stop measuring", () => measuring.on && measuring.toggle()],
+    ...other ? [["b", "One scan in place of the other", swap]] : [],
+  ] : [];
+  const stage = html`<canvas ref=${canvas} tabindex="0" role="application" aria-label="Mesh in 3-D" class=${measuring.on ? "aim" : ""} onPointerMove=${rest} onPointerLeave=${leave}></canvas>
+    ${view && html`<${Marks} view=${view} measuring=${measuring} pointed=${spot} />`}
+    ${measuring.on && html`<p class="next" role="status">${measuring.refused ?? `${measuring.next} Or turn it, and press Enter for the point in the middle.`}</p>`}
+    ${over && html`<div class="over middle">${over}</div>`}
+    ${problem && html`<div class="over middle"><${Refusal} problem=${problem} /></div>`}`;
+  const top = html`<${Choice} label="Colours" value=${mode} options=${offered} chosen=${setMode} /><${Choice} label="Form" value=${form} options=${FORMS} chosen=${setForm} />`;
+  const bottom = html`<div class="notes"><${Legend} mode=${mode} range=${range} axis=${report?.axis} styles=${styles} told=${told} other=${other} back=${form === "surface"} />
+      <p role="status">${mine}${other && ` Other scan: ${theirs}`}${told.busy && ` ${told.busy}`}</p></div>
+    <div class="bar">
+      <${Action} aria-pressed=${measuring.on} disabled=${!ready} onClick=${measuring.toggle}>Measure<//>
+      ${measuring.on ? html`<${MeasureBar} measuring=${measuring} />` : html`
       <${Action} disabled=${!view} onClick=${() => view.fit()}>Fit<//><${Action} disabled=${!view} onClick=${() => view.front()}>Front<//>
-      ${cameras.map(([name, told]) => html`<${Action} disabled=${!view} onClick=${() => view.from(told)}>From ${name}<//>`)}
-      ${other && html`<${Choice} label="Scans shown" value=${shown.join()} options=${[["true,true", "Both"], ["true,false", "This"], ["false,true", "Other"]]}
+      ${cameras.map(([name, camera]) => html`<${Action} disabled=${!view} onClick=${() => view.from(camera)}>From ${name}<//>`)}
+      ${other && !alone && html`<${Choice} label="Scans shown" value=${shown.join()} options=${[["true,true", "Both"], ["true,false", "This"], ["false,true", "Other"]]}
         chosen=${(value) => setShown(value.split(",").map((each) => each === "true"))} />`}
-    </div>
-    <div class="stage">
-      <canvas ref=${canvas} tabindex="0" role="application" aria-label="Mesh in 3-D" aria-describedby="keys" class=${measuring ? "aim" : ""} onKeyDown=${pressed}></canvas>
-      ${view && html`<${Marks} view=${view} points=${points} measuring=${measuring} />`}
-    </div>
-    <p class="quiet" role="status">${mine}${other && ` Other scan: ${theirs}`}</p>
-    ${mode !== "shaded" && mode !== "albedo" && html`<${Legend} mode=${mode} range=${range} axis=${report?.axis} scale=${scale} />`}
-    ${other && mode === "shaded" && html`<p class="legend"><span class="swatch" style=${{background: PLAIN[0]}}></span>this scan <span class="swatch" style=${{background: PLAIN[1]}}></span>the other; key B shows one in place of the other</p>`}
-    ${measuring && html`<p>${points.length % 2 ? "Now the second point." : "Choose the first point: click on the mesh, or turn it and press Enter for the point in the middle."}</p>`}
-    ${pairs.length > 0 && html`<${Distances} pairs=${pairs} cleared=${() => setPoints([])} />`}
-    ${again && html`<${Action} disabled=${!view} onClick=${() => again(view.seen())}>Scan only what is seen here<//>`}
-    <p class="quiet" id="keys">Drag turns, two fingers or the right button move, the wheel zooms. Keys: arrows turn, + and − zoom, F fits, R is the front.</p>`;
+      ${again && html`<${Action} disabled=${!view} onClick=${() => again(view.seen())}>Limit the next scan to this view<//>`}`}
+    </div>`;
+  const measured = measuring.done.length > 0 && html`<${Panel} key="measured" name="Measurements"><${Measured} done=${measuring.done} clear=${measuring.clear} /><//>`;
+  return html`<${Workspace} label="Mesh" stage=${stage} top=${top} bottom=${bottom} keys=${keys}>${children && html`${head}${measured}${children}`}<//>
+    ${!children && measured}`;
 }
 
-/** Show a scan's mesh in a slot of the view, coarse first. Returns how far it is, in words. */
+const hitOf = (hit) => hit && {mm: hit.pointMm};
+
+/** Show a scan's mesh in a slot of the view, coarse first. Returns how far it is, in words, and the meshes `coarse` and `full` that are here. */
 function useLevels(view, slot, scan, setProblem) {
   const [words, setWords] = useState("");
   const [meshes, setMeshes] = useState({});
@@ -107,7 +135,7 @@ function useLevels(view, slot, scan, setProblem) {
     if (!scan) return undefined;
     const ending = new AbortController();
     const load = async () => {
-      setWords("The picture comes.");
+      setWords("Loading the mesh …");
       for (const [level, path] of [["coarse", "coarse.glb"], ["full", "view.glb"]]) {
         const mesh = await fetchMesh(`${scan.links.self}/${path}`, ending.signal, (share) => level === "full" && setWords(`A coarse picture; ${percent(Math.round(20 * share) / 20)} of the whole is here.`));
         setMeshes((before) => ({...before, [level]: mesh}));
@@ -122,37 +150,41 @@ function useLevels(view, slot, scan, setProblem) {
       setMeshes({});
     };
   }, [scan?.id]);
-  return words;
+  return [words, meshes];
 }
 
-/** Above the picture: points, lines between two of them, a bar of a round length. */
-function Marks({view, points, measuring}) {
-  const placed = points.map((each) => view.place(each.pointMm));
-  const most = 120 * view.mmPerPx;
-  const power = 10 ** Math.floor(Math.log10(most));
-  const bar = [5, 2, 1].map((each) => each * power).find((each) => each <= most);
-  const {clientHeight: height, clientWidth: width} = view.canvas;
-  return html`<svg aria-hidden="true">
-    ${placed.map(([x, y], at) => html`<circle cx=${x} cy=${y} r="5" />${at % 2 === 1 && html`<line x1=${placed[at - 1][0]} y1=${placed[at - 1][1]} x2=${x} y2=${y} />
-      <text x=${x + 8} y=${y - 8}>${(at + 1) / 2}</text>`}`)}
-    ${measuring && html`<path d=${`M${width / 2 - 8} ${height / 2}h16M${width / 2} ${height / 2 - 8}v16`} />`}
-    ${bar && html`<path d=${`M16 ${height - 22}v6h${bar / view.mmPerPx}v-6`} /><text x="20" y=${height - 22}>${length(bar)}</text>`}
-  </svg>`;
+/** The ends of the values that are coloured: of σ and stripes as stored, of all others in mm. */
+function useRange(mode, scan, report, coarse, told) {
+  const sigma = scan.summary?.mesh?.sigma_mm;
+  const [depth, setDepth] = useState([0, 1]);
+  useEffect(() => {
+    const {array = [], width = 1} = coarse?.attributes.POSITION ?? {};
+    const z = Float64Array.from({length: array.length / width}, (_, vertex) => array[vertex * width + 2]).sort();
+    if (z.length) setDepth([0.01, 0.99].map((share) => coarse.originMm[2] + coarse.stepMm * z[Math.round(share * (z.length - 1))]));
+  }, [coarse]);
+  const ranges = {
+    sigma: sigma && [sigma.p5, sigma.p95].map((mm) => mm / SIGMA_STEP_MM), stripe: [0, report?.frames.projector_px[report.axis === "row" ? 1 : 0] ?? 1], depth, deviation: told.range,
+  };
+  const [least, most] = ranges[mode] ?? [0, 1];
+  return most > least ? [least, most] : [least, least + 1];
 }
 
-function Legend({mode, range, axis, scale}) {
-  const written = mode === "sigma" ? (value) => length(value * SIGMA_STEP_MM) : (value) => `${Math.round(value)} px`;
-  return html`<div class="scale"><p>${mode === "sigma" ? "Standard deviation along the normal; the ends are the 5 % and 95 % of this scan" : `Projector ${axis ?? "column"}`}. Grey: not known.</p>
-    <div style=${{background: scale}}></div>
-    <div class="between">${[range[0], (range[0] + range[1]) / 2, range[1]].map((value) => html`<span>${written(value)}</span>`)}</div></div>`;
-}
+const inMm = (mm) => `${Number(mm.toPrecision(3)).toString().replace("-", "−")} mm`;
+const SCALES = {
+  sigma: ["Standard deviation along the normal; the ends are the 5 % and 95 % of this scan.", (value) => inMm(value * SIGMA_STEP_MM)],
+  stripe: ["Projector line.", (value) => `${Math.round(value)} px`],
+  depth: ["Depth, z of the scan's axes; nearer is less.", inMm],
+  deviation: ["Distance to the other scan; orange lies before it, blue behind.", inMm],
+};
 
-function Distances({pairs, cleared}) {
-  const at = ({pointMm}) => pointMm.map((mm) => mm.toFixed(3)).join(", ");
-  return html`<div class="wide"><table class="distances"><caption>Distances</caption>
-      <thead><tr><th>No.</th><th>Distance</th><th>σ</th><th>From, to (x, y, z in mm)</th></tr></thead>
-      <tbody>${pairs.map(([a, b], number) => html`<tr><td>${number + 1}</td><td>${Math.hypot(...a.pointMm.map((mm, axis) => mm - b.pointMm[axis])).toFixed(3)} mm</td>
-        <td>${length(Math.hypot(a.sigmaMm, b.sigmaMm))}</td><td>${at(a)}<br />${at(b)}</td></tr>`)}</tbody></table></div>
-    <p class="quiet">σ joins those of the two points, as if each lay along the line. It holds noise, and the calibration's error where that is stated. Not in it: where you clicked, and what both points share, such as a wrong scale.</p>
-    <${Action} onClick=${cleared}>Clear<//>`;
+function Legend({mode, range: [least, most], axis, styles, told, other, back}) {
+  if (SCALES[mode]) {
+    const [words, written] = SCALES[mode];
+    return html`<div class="scale"><p>${mode === "stripe" ? `Projector ${axis ?? "column"}.` : words} Grey: not known.</p>
+      <div style=${{background: mode === "deviation" ? styles.signed : styles.scale}}></div>
+      <div class="between">${[least, (least + most) / 2, most].map((value) => html`<span>${written(value)}</span>`)}</div>${told.words && html`<p>${told.words}</p>`}</div>`;
+  }
+  const entries = mode === "cause" || mode === "views" ? told.kinds.filter(({share}) => share > LEAST_SHARE).sort((a, b) => b.share - a.share).map(({colour, words, share}) => [colour, `${words}, ${percent(Number(share.toPrecision(2)))}`])
+    : mode === "shaded" ? [...other ? [[PLAIN[0], "this scan"], [PLAIN[1], "the other"]] : [], ...back ? [[styles.back, "back side"]] : []] : [];
+  return html`<div class="scale">${told.chooser}${entries.map(([colour, words]) => html`<div class="legend"><span class="swatch" style=${{background: colour}}></span>${words}</div>`)}</div>`;
 }

@@ -4,6 +4,7 @@ import {limitToBox, limits} from "./limits.js";
 import {Mesh, loadDrawing} from "./mesh.js";
 import {ask, follow, once, useAction, useValue} from "./service.js";
 import {Action, Confirm, Facts, JobBadge, Progress, Refusal, count, length, moment, percent} from "./ui.js";
+import {Panel, Workspace} from "./workspace.js";
 import {html, useEffect, useState} from "./vendor/preact-htm.js";
 
 const OVER = ["succeeded", "failed", "cancelled", "interrupted"];
@@ -33,9 +34,9 @@ export function ResultScreen({id, may}) {
     loadDrawing().catch(() => {});
   }, []);
   if (problem?.status === 404 || problem?.status === 422)
-    return html`<${Back} /><${Refusal} problem=${{document: {title: "This scan is not there"}, message: "It was deleted, or the address is not right."}} />`;
+    return html`<${Back} /><${Refusal} problem=${{document: {title: "Scan not found"}, message: "It was deleted, or the address is not right."}} />`;
   if (!scan) return html`<${Back} /><${Refusal} problem=${problem} />${!problem && html`<p class="wait">Asking for the scan …</p>`}`;
-  return html`<${Back} /><${Result} scan=${scan} again=${again} may=${may} />`;
+  return html`<${Result} scan=${scan} again=${again} may=${may} />`;
 }
 
 const Back = () => html`<p><a href="#/scan">All scans</a></p>`;
@@ -45,32 +46,30 @@ function Result({scan, again, may}) {
   const over = OVER.includes(scan.state);
   const [told, setTold] = useState(scan.progress);
   const [report, refused] = useValue(files["report.json"] ?? null);
+  const [calibration] = useValue(files["calibration.json"] ?? null);
   const [other, setOther] = useState(null);
+  const [pointed, point] = useState(null);
   useEffect(() => over ? undefined : follow(scan.links.events, (kind, data) => {
     if (kind === "progress") setTold(data);
     else again();
   }, again), [over]);
   const hasMesh = MESH in files;
-  return html`
-    <div class="between"><h2>${scan.label ?? `Scan of ${moment(scan.created_at)}`} <${JobBadge} state=${scan.state} /></h2>
-      ${hasMesh && html`<a class="action primary" href=${files[MESH]} download="mesh.ply">Download the mesh</a>`}</div>
-    <div class="two">
-      <section aria-label="Mesh">
-        ${!over && html`<div class="box">
-          ${hasMesh && html`<p role="status">The mesh is there and can be downloaded. The rest is computed still.</p>`}
-          <${Progress} label=${told.stage} fraction=${told.fraction} detail=${told.detail} /></div>`}
-        ${hasMesh && html`<${Mesh} key=${scan.id} scan=${scan} other=${other} report=${report} again=${may("scan") ? limitToBox : null} />`}
-        ${over && !hasMesh && html`<${Ended} scan=${scan} may=${may} />`}
-        ${over && hasMesh && html`<${Compare} scan=${scan} chosen=${setOther} />`}
-      </section>
-      <section aria-label="Figures">
-        <${Refusal} problem=${refused} />
-        ${hasMesh && html`<${Figures} scan=${scan} report=${report} />`}
-        ${Object.keys(files).length > 0 && html`<${Downloads} key=${over} files=${files} />`}
-        <${Keeping} scan=${scan} over=${over} again=${again} may=${may} />
-      </section>
-    </div>
-    ${report && Object.entries(report.cameras).map(([name, told]) => html`<${Causes} key=${name} camera=${name} told=${told} causes=${report.causes} files=${files} />`)}`;
+  const progress = !over && html`<div class="box">
+    ${hasMesh && html`<p role="status">The mesh is ready. The other files are being computed.</p>`}
+    <${Progress} label=${told.stage} fraction=${told.fraction} detail=${told.detail} /></div>`;
+  const head = html`<div class="head"><${Back} />
+      <h2>${scan.label ?? `Scan of ${moment(scan.created_at)}`} <${JobBadge} state=${scan.state} /></h2>
+      ${hasMesh && html`<a class="action primary" href=${files[MESH]} download="mesh.ply">Download the mesh</a>`}</div><${Refusal} problem=${refused} />`;
+  const panels = html`${hasMesh && html`<${Panel} name="Figures"><${Figures} scan=${scan} report=${report} /><//>`}
+    ${report && Object.entries(report.cameras).map(([name, camera]) => html`<${Panel} key=${name} name=${`Camera ${name}`}>
+      <${Causes} camera=${name} told=${camera} causes=${report.causes} files=${files} device=${calibration?.cameras[name] ?? null} pointed=${pointed} point=${point} /><//>`)}
+    ${over && hasMesh && html`<${Panel} name="Compare"><${Compare} scan=${scan} chosen=${setOther} /><//>`}
+    ${Object.keys(files).length > 0 && html`<${Panel} name="Files" open=${false}><${Downloads} key=${over} files=${files} /><//>`}
+    <${Panel} name="Keep or delete"><${Keeping} scan=${scan} over=${over} again=${again} may=${may} /><//>`;
+  if (hasMesh)
+    return html`<${Mesh} key=${scan.id} scan=${scan} other=${other} report=${report} calibration=${calibration} again=${may("scan") ? limitToBox : null} over=${progress}
+      pointed=${pointed} point=${point} head=${head}>${panels}<//>`;
+  return html`<${Workspace} label="Mesh" stage=${html`<div class="over middle">${over ? html`<${Ended} scan=${scan} may=${may} />` : progress}</div>`}>${head}${panels}<//>`;
 }
 
 /** A scan without a mesh: why, and what now. */
@@ -101,7 +100,6 @@ function Figures({scan, report}) {
   const age = calibration?.age_days;
   return html`
     ${warnings.length > 0 && html`<h3>Take note</h3><ul class="warning">${warnings.map((each) => html`<li>${each}</li>`)}</ul>`}
-    <h3>Figures</h3>
     <${Facts} of=${[
       ...figures(scan).map(([name, value, written]) => [name, value === undefined ? null : written(value)]),
       ["σ holds", summary.mesh.sigma_holds],
@@ -131,7 +129,7 @@ function Compare({scan, chosen}) {
   const [other] = useValue(id ? `/scan/${id}` : null);
   useEffect(() => chosen(id ? other : null), [id, other]);
   const rows = other?.summary?.mesh && scan.summary?.mesh ? figures(scan).map((row, at) => [...row, figures(other)[at][1]]) : [];
-  return html`<h3>Compare</h3><${Refusal} problem=${problem?.status ? problem : null} />
+  return html`<${Refusal} problem=${problem?.status ? problem : null} />
     ${list && possible.length === 0 ? html`<p class="quiet">There is no other scan with a mesh yet.</p>` : html`
       <label>with <select value=${id} onChange=${(event) => setId(event.target.value)}>
         <option value="">no other scan</option>
@@ -140,7 +138,7 @@ function Compare({scan, chosen}) {
     ${rows.length > 0 && html`<div class="wide"><table><thead><tr><th>Figure</th><th>This scan</th><th>The other</th><th>Difference</th></tr></thead>
       <tbody>${rows.map(([name, mine, written, theirs]) => html`<tr><th scope="row">${name}</th><td>${mine === undefined ? "–" : written(mine)}</td>
         <td>${theirs === undefined ? "–" : written(theirs)}</td><td>${mine === undefined || theirs === undefined ? "–" : `${theirs < mine ? "−" : "+"}${written(Math.abs(theirs - mine))}`}</td></tr>`)}</tbody></table></div>
-      <p class="quiet">Both are shown where their own calibration puts them. How far apart the surfaces are is not computed here.</p>`}`;
+      <p class="quiet">Each is shown where its own calibration puts it. The colours "Deviation" show how far this mesh is from the other one.</p>`}`;
 }
 
 function Downloads({files}) {
@@ -152,7 +150,7 @@ function Downloads({files}) {
         if (answer.ok && bytes) setSizes((before) => ({...before, [name]: bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`}));
       }, () => {});
   }, []);
-  return html`<h3>Files</h3><div class="wide"><table><thead><tr><th>File</th><th>Size</th><th>For</th></tr></thead>
+  return html`<div class="wide"><table><thead><tr><th>File</th><th>Size</th><th>For</th></tr></thead>
     <tbody>${Object.entries(files).map(([name, path]) => html`<tr><td><a href=${path} download=${name}>${name}</a></td>
       <td>${sizes[name] ?? (isMadeLater(name) ? "made when asked for" : "–")}</td><td>${purpose(name)}</td></tr>`)}</tbody></table></div>`;
 }
@@ -166,7 +164,7 @@ function Keeping({scan, over, again, may}) {
   }));
   const problem = uncancelled ?? unpinned ?? unremoved;
   if (!may("scan")) return null;
-  return html`<h3>Keep or delete</h3>
+  return html`
     ${sure ? html`<${Confirm} question="Delete this scan with all its files? Nothing brings it back." yes="Delete it" onYes=${remove} onNo=${() => setSure(false)} />`
     : html`<div class="row">
         ${!over && html`<${Action} busy=${cancelling} onClick=${cancel}>Stop it<//>`}

@@ -107,13 +107,14 @@ def test_what_the_page_measures_lies_within_two_sigma_of_the_truth(tmp_path: Pat
     plate = [PLATE_MM + TURNED @ np.array(each) for each in ((-70.0, 55.0, 0.0), (0.0, 62.0, 0.0), (-80.0, -50.0, 0.0))]
     seen = [on_plate(each) for each in plate]
     straight = np.linalg.norm(seen[0] - seen[1]), np.linalg.norm(seen[0] - seen[2])
+    ball, pipe = on_ball(BALL_MM), on_pipe(PIPE_MM)
     # Seen at right angles to its axis, so that its section is a circle.
     before = [PIPE_MM + TURNED @ np.array((right, 0.0, -500.0)) for right in (-9.0, 9.0)]
     rays = [[each, each + 100.0 * TURNED[:, 2]] for each in before]
     asked = {
         "along the plate": ("distance", aimed(plate[0], plate[2]), straight[1]),
-        "from the ball to the pipe": ("distance", aimed(BALL_MM, PIPE_MM), np.linalg.norm(on_ball(BALL_MM) - on_pipe(PIPE_MM))),
-        "from the ball to the plate": ("plane", aimed(plate[0], BALL_MM), abs((on_ball(BALL_MM) - PLATE_MM) @ TURNED[:, 2])),
+        "from the ball to the pipe": ("distance", aimed(BALL_MM, PIPE_MM), np.linalg.norm(ball - pipe)),
+        "from the ball to the plate": ("plane", aimed(plate[0], BALL_MM), abs((ball - PLATE_MM) @ TURNED[:, 2])),
         "the ball": ("sphere", aimed(BALL_MM), BALL_RADIUS_MM),
         "the pipe": ("cylinder", aimed(PIPE_MM), PIPE_RADIUS_MM),
         "a section of the plate": ("section", aimed(plate[0], plate[1]), straight[0]),
