@@ -499,7 +499,7 @@ async def fetch_together(
     answer is 503 with `Retry-After`, and the next request goes on from there.
     """
     held.enter_context(service.streams.take())
-    until_s = time.monotonic() + LONGEST_WAIT_S
+    until_s = time.monotonic() + REQUEST_WAIT_S
     named: dict[str, Path] = {}
     for number, scan_id in enumerate(dict.fromkeys(scan)):
         path = service.folder.scan(scan_id) / file

@@ -161,7 +161,7 @@ def test_path_names_all_its_methods_where_another_is_refused(client: TestClient)
         methods = {method.upper() for method in operations}
         if "GET" in methods and not path.endswith(STREAMS):
             methods.add("HEAD")
-        for method in ("PATCH", *sorted({"PUT", "GET", "HEAD", "DELETE", "POST"} - methods)[:1]):
+        for method in sorted({"PATCH", "PUT", "GET", "HEAD", "DELETE", "POST"} - methods)[:2]:
             refused = client.request(method, filled(path))
             assert refused.status_code == 405, (method, path)
             assert refused.headers["Allow"] == ", ".join(sorted(methods))
