@@ -62,7 +62,7 @@ class NetworkCamera:
             assert encoded
             sent = bytes(data)
             if cut:
-                # Of holes of 100 bytes one in 250 leaves a JPEG that decodes to a whole picture, as no decoder can know.
+                # Of holes of 100 bytes one in 250 leaves a JPEG that decodes to a whole picture: no decoder knows.
                 end, again = rng.choice([(len(sent) // 2, len(sent)), (len(sent) // 3, len(sent) // 3 * 2)])
                 sent = sent[:end] + sent[again:]
             if not lost and time.monotonic_ns() < end_ns + self.delay_s * 1e9:

@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import AsyncIterator, Iterator
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -567,6 +568,7 @@ def test_too_many_requests_of_one_name_wait(
 ) -> None:
     slow = served.service.settings.model_copy(update={"requests_per_s": 1.0})
     monkeypatch.setattr(served.service, "settings", slow)
+    monkeypatch.setattr(access, "Rates", partial(access.Rates, clock=lambda: 0.0))
     app = create_app(served.service, ring=ring)
     ann = TestClient(app, base_url=HERE, headers={"X-API-Key": ring.add("Ann", [])})
     bob = TestClient(app, base_url=HERE, headers={"X-API-Key": ring.add("Bob", [])})
