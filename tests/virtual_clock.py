@@ -77,8 +77,10 @@ class VirtualClock:
 
     def _pass(self, t_ns: int, stop: threading.Event) -> None:
         with self._changed:
-            while not stop.is_set():
+            while True:
                 self._await_threads()
+                if stop.is_set():
+                    return
                 thread = min(self._due_ns, key=self._due_ns.__getitem__, default=None)
                 thread_ns = t_ns + 1 if thread is None else self._due_ns[thread]
                 if self._calls and self._calls[0][0] <= min(t_ns, thread_ns):

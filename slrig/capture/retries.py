@@ -66,6 +66,12 @@ class RetryPolicy:
                 f"with one another; the last cause: {self._last_cause}"
             )
 
+    def holds(self, camera: str, index: int) -> bool:
+        """True if a pattern that is shown again stays until its frame was checked. Where one was lost for the first
+        time, it is shown no longer than any other.
+        """
+        return len(self._missing[camera, index]) != 1
+
     def make_shot(self, index: int, frame: Frame) -> Shot:
         """Return a frame as a shot, with its time since the start of the first frame."""
         if self._t_first_ns is None:

@@ -54,7 +54,7 @@ def capture(
     with ExitStack() as leaving:
         for camera in rig.cameras.values():
             leaving.callback(_suppress_errors, camera.disarm)
-        reader = FrameReader(rig.cameras)
+        reader = FrameReader(rig.cameras, rig.clock)
         leaving.callback(reader.stop)
         with ExitStack() as lit:
             # Switch the light off first.

@@ -17,6 +17,7 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,7 +25,7 @@ import numpy as np
 from slrig.capture.latency import shutter_skew_s, stable_from_ns
 from slrig.capture.retries import RetryPolicy
 from slrig.capture.triggering import CaptureSession, with_camera_name
-from slrig.devices import Camera, DisplayedPattern, Rig, Trigger
+from slrig.devices import Camera, Clock, DisplayedPattern, Rig, Trigger
 from slrig.errors import FrameTimeoutError
 from slrig.model import Frame, Shot
 
@@ -49,8 +50,8 @@ _CHECK_TIME_S = 0.012  # to leave before a pattern is due; checking a frame of 1
 _POLL_S = 0.05  # between checks for a cancellation or overdue frames
 _MAX_PAIRED = 8  # frames that may wait to be checked before the next pattern
 
-Arrival = tuple[str, Frame | Exception]
-"""A camera's name in its rig, and its next frame or the exception of its driver."""
+Arrival = tuple[str, Frame | Exception | None]
+"""A camera's name in its rig, and its next frame or the exception of its driver; None once it is armed."""
 
 
 class Cadence:
@@ -93,51 +94,63 @@ class Cadence:
 
 
 class FrameReader:
-    """Reads every frame of several armed cameras, each on its own thread, until it is stopped.
+    """Arms several cameras to run freely, and reads every frame of them, each on its own thread, until it is stopped.
 
-    Meanwhile no other thread may call these cameras. An exception of a driver ends the thread of its camera; missing
-    frames are ignored.
+    All are started at the same moment: that takes as long as the slowest, and cameras of one model run nearly in phase,
+    so that a pattern need not wait for one after the other. Meanwhile no other thread may call these cameras. An
+    exception of a driver ends the thread of its camera; missing frames are ignored.
     """
 
-    def __init__(self, cameras: Mapping[str, Camera]) -> None:
-        self._cameras = cameras
+    def __init__(self, cameras: Mapping[str, Camera], clock: Clock) -> None:
+        self._cameras, self._clock = cameras, clock
         self._arrived: queue.SimpleQueue[Arrival] = queue.SimpleQueue()
-        self._stopped = threading.Event()
-        self._threads: list[threading.Thread] = []
+        self._came, self._stopped = threading.Event(), threading.Event()
+        self._threads: list[tuple[threading.Thread, threading.Event]] = []
 
-    def start(self) -> None:
-        """Start reading. The cameras must be armed."""
+    def start(self, count: int) -> None:
+        """Arm the cameras for `count` frames, and read."""
         for name, camera in self._cameras.items():
+            ended = threading.Event()
             thread = threading.Thread(
-                target=self._read, args=(name, camera), name=f"slrig-frames of {name}", daemon=True
+                target=self._read, args=(name, camera, count, ended), name=f"slrig-frames of {name}", daemon=True
             )
-            self._threads.append(thread)
+            self._threads.append((thread, ended))
             thread.start()
 
     def next(self, timeout_s: float) -> Arrival | None:
-        """Return the next frame or exception of any camera, in the order of arrival; None after the time-out."""
+        """Return what came next of any camera, in the order of arrival; None after the time-out, by the rig's clock."""
+        self._came.clear()
+        if self._arrived.empty():
+            self._clock.wait_until(self._clock.now_ns() + round(timeout_s * 1e9), self._came)
         try:
-            return self._arrived.get(timeout=timeout_s)
+            return self._arrived.get_nowait()
         except queue.Empty:
             return None
 
     def stop(self) -> None:
         """Stop reading, and return when no thread uses a camera. Idempotent."""
         self._stopped.set()
-        for thread in self._threads:
+        for thread, ended in self._threads:
+            while not ended.is_set():
+                self._clock.wait_until(self._clock.now_ns() + round(_READ_TIMEOUT_S * 1e9), ended)
             thread.join()
         self._threads.clear()
 
-    def _read(self, name: str, camera: Camera) -> None:
-        while not self._stopped.is_set():
-            try:
-                frame = camera.read(0, _READ_TIMEOUT_S)
-            except FrameTimeoutError:
-                continue
-            except Exception as error:  # noqa: BLE001 - raised again on the capturing thread
-                self._arrived.put((name, error))
-                return
-            self._arrived.put((name, frame))
+    def _read(self, name: str, camera: Camera, count: int, ended: threading.Event) -> None:
+        try:
+            camera.arm(count, Trigger.FREE)
+            self._put(name, None)
+            while not self._stopped.is_set():
+                with suppress(FrameTimeoutError):
+                    self._put(name, camera.read(0, _READ_TIMEOUT_S))
+        except Exception as error:  # noqa: BLE001 - raised again on the capturing thread
+            self._put(name, error)
+        finally:
+            ended.set()
+
+    def _put(self, name: str, came: Frame | Exception | None) -> None:
+        self._arrived.put((name, came))
+        self._came.set()
 
 
 def earliest_change_s(rig: Rig, triggers: dict[str, Trigger]) -> float | None:
@@ -209,11 +222,9 @@ def capture_streaming(
 
     earliest_s : see `earliest_change_s`. Raises as `RetryPolicy` does, and the exceptions of the cameras' drivers.
     """
-    rig = session.rig
-    rig.projector.load(session.sequence)
-    for camera in rig.cameras.values():
-        camera.arm(retries.max_exposures, Trigger.FREE)
-    reader.start()
+    reader.start(retries.max_exposures)
+    # While the cameras start.
+    session.rig.projector.load(session.sequence)
     yield from _StreamingCapture(session, retries, reader, round(earliest_s * 1e9)).shots()
 
 
@@ -233,6 +244,7 @@ class _StreamingCapture:
             )
             for name, camera in session.rig.cameras.items()
         }
+        self._starting = set(self._camera_states)
         self._displays: deque[_Display] = deque()
         self._paired: deque[tuple[int, Frame, str | None]] = deque()
         self._lead = _DisplayLead(round((session.rig.projector.info.refresh_s or 0.0) * 1e9))
@@ -241,14 +253,18 @@ class _StreamingCapture:
 
     def shots(self) -> Iterator[Shot]:
         """See `capture_streaming`."""
+        while self._starting:
+            self._session.stop_if_cancelled(0)
+            self._receive_next(_POLL_S)
         retries = self._retries
         remaining_indices = iter(range(len(self._session.sequence)))
         while True:
-            is_retry = bool(retries.pending)
-            if is_retry:
+            held = False
+            if retries.pending:
                 # Failed patterns come first, in order.
                 index = min(retries.pending)
                 names = retries.pending.pop(index)
+                held = any(retries.holds(name, index) for name in names)
             elif (index := next(remaining_indices, -1)) >= 0:
                 names = list(self._camera_states)
             elif self._displays or self._paired:
@@ -256,7 +272,7 @@ class _StreamingCapture:
                 continue
             else:
                 return
-            self._show(index, names, held=is_retry)
+            self._show(index, names, held=held)
             yield from self._process_until_due(last=False)
 
     def _show(self, index: int, names: list[str], *, held: bool) -> None:
@@ -292,9 +308,7 @@ class _StreamingCapture:
             elif left_s <= 0:
                 return
             else:
-                arrival = self._reader.next(min(left_s, _POLL_S))
-                if arrival is not None:
-                    self._receive(*arrival)
+                self._receive_next(min(left_s, _POLL_S))
 
     def _due_ns(self, *, last: bool) -> int | None:
         """Return when to request the next pattern; None if that depends on frames that are not yet received or
@@ -329,10 +343,17 @@ class _StreamingCapture:
             due_ns = max(due_ns, start_ns + spare_ns + span_ns - self._lead.ns)
         return due_ns
 
-    def _receive(self, name: str, arrival: Frame | Exception) -> None:
-        if isinstance(arrival, Exception):
-            raise arrival
-        frame = with_camera_name(name, arrival)
+    def _receive_next(self, timeout_s: float) -> None:
+        arrival = self._reader.next(timeout_s)
+        if arrival is None:
+            return
+        name, came = arrival
+        if isinstance(came, Exception):
+            raise came
+        if came is None:
+            self._starting.remove(name)
+            return
+        frame = with_camera_name(name, came)
         state = self._camera_states[name]
         state.waiting.append((frame, self._session.frame_fault(frame, frame.t_start_ns, state.last)))
         state.cadence.add(frame)

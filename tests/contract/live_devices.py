@@ -1,4 +1,4 @@
-"""A display and webcams in real time on a stage, by the timing rules of the drivers `screen` and `v4l2`."""
+"""A display and webcams on a stage, in its time, by the timing rules of the drivers `screen` and `v4l2`."""
 
 from __future__ import annotations
 
@@ -25,6 +25,9 @@ from tests.contract.stage import Stage, StagedProjector
 from tests.contract.wired_camera import Exposure as Exposed
 
 BUFFERS = 4
+EYES = ("eye", "other eye")
+READERS = tuple(f"slrig-frames of {name}" for name in EYES)
+"""Threads that read them, as a `VirtualClock` has to know."""
 
 
 class LiveDisplay(StagedProjector):
@@ -69,10 +72,12 @@ class LiveDisplay(StagedProjector):
 @dataclass(frozen=True, slots=True)
 class Webcam:
     """What a camera on USB is like. Times in s; jitter_s: its stamps come later by up to so much, at random; the
-    probabilities are of one frame. damaged: rows of it are noise, and nothing says so.
+    probabilities are of one frame. damaged: rows of it are noise, and nothing says so. start_s: from arming to its
+    first frame, which arming waits for; 0: it begins at once, and where in its period is chance.
     """
 
     fps: float = 30.0
+    start_s: float = 0.0
     delivery_s: float = 0.02
     jitter_s: float = 0.0005
     lost: float = 0.0
@@ -100,10 +105,14 @@ class LiveCamera:
         return AppliedSettings(settings.exposure_s, settings.gain, self._period_ns / 1e9)
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """See `Camera`. Where in its period it begins is chance."""
+        """See `Camera`."""
         self._state.check_arming(count, trigger, self.info)
         self._state.armed = trigger
-        self._begun_ns = self._stage.clock.now_ns() + round(self._period_ns * float(self._rng.random()))
+        start_s = self._webcam.start_s
+        starts_ns = round(start_s * 1e9) or round(self._period_ns * float(self._rng.random()))
+        self._begun_ns = self._stage.clock.now_ns() + starts_ns
+        if start_s:
+            self._stage.clock.wait_until(self._begun_ns, self._state.closed)
         self._next, self._number, self._dropped = 0, -1, 0
         self._kept.clear()
 
@@ -165,8 +174,11 @@ class LiveCamera:
         return image
 
 
-def live_rig(stage: Stage, webcam: Webcam, *, refresh_hz: float) -> Rig:
-    camera = LiveCamera("eye", stage, webcam)
-    return Rig(
-        "live", {"eye": camera}, LiveDisplay(stage, refresh_hz=refresh_hz), {"eye": CameraSettings(1 / refresh_hz)}
-    )
+def live_rig(stage: Stage, *webcams: Webcam, refresh_hz: float, exposure_s: float) -> Rig:
+    """A rig of one camera or two, on the stage's clock."""
+    cameras = {
+        name: LiveCamera(name, stage, each, seed=seed)
+        for seed, (name, each) in enumerate(zip(EYES, webcams, strict=False))
+    }
+    settings = dict.fromkeys(cameras, CameraSettings(exposure_s))
+    return Rig("live", cameras, LiveDisplay(stage, refresh_hz=refresh_hz), settings, clock=stage.clock)

@@ -69,7 +69,7 @@ def bench(habit: Habit) -> Iterator[tuple[Rig, VirtualDevice]]:
         camera=SIZE, projector=SIZE, first_column_px=2.0, columns_per_px=0.8, rows_per_px=0.8, blur_px=0.6,
         **{"noise_dn": 1.0, "white": 0.5, **habit.scene},
     )  # fmt: skip
-    stage = Stage(scene, latency_s=0.02, jitter_s=0.004, clock=VirtualClock())
+    stage = Stage(scene, latency_s=0.02, jitter_s=0.004, clock=VirtualClock(threads={"slrig-frames of left"}))
     with VirtualDevice(stage, faked(habit)) as device:
         camera = device.open_camera(gain_unity=GAIN_UNITS, **habit.options)
         settings = {"left": CameraSettings(1 / 60)}

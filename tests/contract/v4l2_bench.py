@@ -187,7 +187,6 @@ class VirtualDevice:
     """A fake camera that is plugged in, and the driver before it. A context manager, which closes what was opened."""
 
     def __init__(self, stage: Stage, faked: Faked) -> None:
-        assert isinstance(stage.clock, VirtualClock)
         self.stage, self.clock = stage, stage.clock
         self.sensor = Sensor(
             stage, readout_s=faked.readout_s, bands=faked.bands, noise_when_corrupt=faked.noise_when_corrupt

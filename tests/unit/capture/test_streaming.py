@@ -11,8 +11,8 @@ import pytest
 from slrig.bundle.sidecars import RefusedFrame
 from slrig.capture.sequencer import capture
 from slrig.capture.streaming import Cadence, FrameReader, _DisplayLead
-from slrig.devices import Camera, Synchronisation, Trigger
-from slrig.errors import DeviceGoneError, FrameTimeoutError
+from slrig.devices import Synchronisation, SystemClock, Trigger
+from slrig.errors import DeviceGoneError, DeviceStateError, FrameTimeoutError
 from slrig.model import Frame
 from tests.contract.live_devices import Webcam
 from tests.contract.test_streaming import SEQUENCE, live
@@ -98,27 +98,28 @@ FREE = frozenset({Trigger.FREE})
 PATIENCE_S = 10.0
 
 
-def armed(**faults: object) -> Camera:
-    camera = fake_rig(
+def reading(**faults: object) -> FrameReader:
+    fake = fake_rig(
         cameras=["eye"],
         triggers={"eye": FREE},
         faults={"eye": CameraFaults(**faults)},  # type: ignore[arg-type]
-    ).cameras["eye"]
-    camera.arm(10, Trigger.FREE)
-    return camera
+    )
+    reader = FrameReader({"top": fake.cameras["eye"]}, SystemClock())
+    reader.start(10)
+    return reader
 
 
 def test_every_frame_comes_in_order_and_reading_ends() -> None:
-    reader = FrameReader({"top": armed()})
-    reader.start()
+    reader = reading()
+    came = [reader.next(PATIENCE_S) for _ in range(6)]
+    assert came[0] == ("top", None)
     numbers = []
-    for _ in range(5):
-        arrival = reader.next(PATIENCE_S)
+    for arrival in came[1:]:
         assert arrival is not None
-        name, came = arrival
+        name, frame = arrival
         assert name == "top"
-        assert isinstance(came, Frame)
-        numbers.append(came.sequence_number)
+        assert isinstance(frame, Frame)
+        numbers.append(frame.sequence_number)
     assert numbers == [0, 1, 2, 3, 4]
     reader.stop()
     reader.stop()
@@ -126,16 +127,24 @@ def test_every_frame_comes_in_order_and_reading_ends() -> None:
 
 
 def test_an_exception_of_a_driver_is_passed_on() -> None:
-    reader = FrameReader({"eye": armed(unplug_at=1)})
-    reader.start()
-    came = [arrival for arrival in (reader.next(PATIENCE_S) for _ in range(3)) if arrival is not None]
+    reader = reading(unplug_at=1)
+    came = [arrival for arrival in (reader.next(PATIENCE_S) for _ in range(4)) if arrival is not None]
     reader.stop()
-    assert isinstance(came[0][1], Frame)
+    assert isinstance(came[1][1], Frame)
     assert isinstance(came[-1][1], DeviceGoneError)
 
 
 def test_no_camera_gives_no_frames() -> None:
-    assert FrameReader({}).next(0.0) is None
+    assert FrameReader({}, SystemClock()).next(0.0) is None
+
+
+def test_nothing_is_lit_before_a_camera_that_does_not_start() -> None:
+    one = live(Webcam())
+    rig = replace(one.rig, synchronisation=Synchronisation(0.0, 0.0, earliest_s=0.0))
+    rig.cameras["eye"].close()
+    with pytest.raises(DeviceStateError, match="closed"):
+        list(capture(rig, SEQUENCE))
+    assert {profile.max() for _, profile in one.stage.changes} == {0}
 
 
 def test_a_camera_that_goes_ends_the_capture_and_its_thread() -> None:
