@@ -62,6 +62,10 @@ class CalibrationError(InvalidInputError, code="calibration"):
     """A calibration is missing, malformed, not finite, or made for devices of another size."""
 
 
+class NotCalibratedError(CalibrationError, code="not-calibrated"):
+    """The rig has no calibration, and a scan would have no millimetres. Nothing was captured."""
+
+
 class PatternError(InvalidInputError, code="pattern"):
     """A pattern cannot be shown or decoded on this projector: too few bits, too small, an impossible period."""
 

@@ -26,7 +26,8 @@ MEDIA_TYPE = "application/problem+json"
 
 _CODES = {
     404: "schedule-not-found camera-not-found calibration-not-found job-not-found preset-not-found",
-    409: "rig-busy scan-cancelled calibration-state artefact-not-ready scan-state key-in-flight rig-file-changed",
+    409: "rig-busy not-calibrated scan-cancelled calibration-state artefact-not-ready scan-state key-in-flight "
+    "rig-file-changed",
     410: "damaged",
     422: "invalid-input config bundle calibration pattern schedule nothing-to-reconstruct "
     "unsupported-by-device wrong-system pose-refused solve-refused registration-refused stage-refused views-failed "

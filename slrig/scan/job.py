@@ -13,7 +13,7 @@ from uuid import UUID, uuid4
 from pydantic import TypeAdapter
 
 from slrig.disk import storage_errors
-from slrig.errors import JobNotFoundError
+from slrig.errors import JobNotFoundError, NotCalibratedError
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.job import Job, JobRun, Outcome, Recording
 from slrig.jobs.manager import JobManager
@@ -68,6 +68,12 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+_NOT_CALIBRATED = (
+    "This rig is not calibrated, and without a calibration a scan has no millimetres. Nothing was captured. Calibrate "
+    "it (slrig calibrate run; POST /calibration; Calibrate on the page), or import a calibration of it and activate "
+    "that (slrig calibrate import; POST /calibration/import)."
+)
+
 PIPELINE = "slrig.scan.reconstruct"
 """What the worker prepares for: the reconstruction of scans, whose kernels are compiled once on each machine."""
 
@@ -118,10 +124,15 @@ class ScanJob(Job):
     def check(self, rig: RigSession) -> int:
         """See `Job`. Frames are counted once as captured, and once for meshes and the zipped bundle of a client.
 
-        Raises PatternError, UnsupportedByDeviceError, CalibrationError.
+        Raises PatternError, UnsupportedByDeviceError, CalibrationError; NotCalibratedError, so that nothing is shot
+        that cannot be reconstructed.
         """
         rig.refuse_misfit()
-        return 0 if rig.facts is None else 2 * check_plan(self.plan, rig.facts, rig.calibration)
+        if rig.facts is None:
+            return 0
+        if rig.calibration is None:
+            raise NotCalibratedError(_NOT_CALIBRATED)
+        return 2 * check_plan(self.plan, rig.facts, rig.calibration)
 
     def capture(self, rig: RigSession, run: JobRun) -> Recording:
         """Record a bundle, and show its frames to the worker meanwhile."""

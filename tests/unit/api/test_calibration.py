@@ -19,8 +19,8 @@ from slrig.model import Size
 from slrig.scan.plan import pattern_sequence
 from tests.unit.api.conftest import ServedBench, ended, refusal
 from tests.unit.api.test_scans import events_of
-from tests.unit.calibrate.calibration_bench import PNG, tame_calibration
-from tests.unit.scan.fakes import WAIT_S
+from tests.unit.calibrate.calibration_bench import PNG
+from tests.unit.scan.fakes import WAIT_S, tame_calibration
 
 BOARD = {"kind": "chessboard", "corners": [4, 3], "square_mm": 10.0}
 JSON = {"Content-Type": "application/json"}
@@ -125,7 +125,7 @@ def test_calibration_is_opened_shot_solved_and_used(calibrating: TestClient, ser
     assert client.get(done["links"]["files"]["calibration.json"]).json()["solved"]["id"] == made["id"]
     assert "default-src 'none'" in client.get(done["links"]["files"]["report.html"]).headers["Content-Security-Policy"]
 
-    assert client.get("/rig").json()["calibration"] is None
+    assert client.get("/rig").json()["calibration"]["source"] == "rig"
     assert client.post(made["links"]["activate"]).json()["active"] is True
     used = client.get("/rig").json()["calibration"]
     assert (used["source"], used["id"], used["expected_error_mm"], used["error"]) == ("session", made["id"], 0.02, None)

@@ -86,8 +86,8 @@ def test_scan_is_accepted_followed_and_fetched(client: TestClient) -> None:
     assert done["summary"] == {"bundle": done["id"], "seconds": 1.5, "truth": {"rms_mm": 0.01}}
     files = done["links"]["files"]
     assert set(files) == {
-        "bundle.zip", "coarse.glb", "mesh.3mf", "mesh.glb", "mesh.obj", "mesh.ply", "mesh.stl", "points.ply",
-        "preview.png", "report.json", "view.glb",
+        "bundle.zip", "calibration.json", "coarse.glb", "mesh.3mf", "mesh.glb", "mesh.obj", "mesh.ply", "mesh.stl",
+        "points.ply", "preview.png", "report.json", "view.glb",
     }  # fmt: skip
     for name, where in files.items():
         assert client.get(where).status_code == 200, name

@@ -21,34 +21,18 @@ from slrig.devices import Rig
 from slrig.errors import PoseRefusedError
 from slrig.jobs.manager import JobManager
 from slrig.jobs.resume import resume
-from slrig.model import Calibration, Pinhole, Size, SolveRecord
+from slrig.model import Calibration, Size
 from slrig.rig.session import ActiveCalibration, RigSession
 from slrig.scan.plan import ProgressCallback
 from tests.samples import put_database
 from tests.unit.scan.bench import Bench, wait_for
-from tests.unit.scan.fakes import WAIT_S, TamePositioner
+from tests.unit.scan.fakes import WAIT_S, TamePositioner, tame_calibration
 from tests.unit.stand_ins import stand_ins
 
 BOARD = Board(BoardKind.CHESSBOARD, 4, 3, 10.0)
 PNG = b"\x89PNG tame"
 POSITIONS = ("near", "far", "tilted")
 GOOD = {"grade": "good", "summary": "good", "reasons": []}
-
-
-CAMERA, PROJECTOR_SIZE = Size(64, 48), Size(64, 40)
-"""Of the tame devices."""
-
-
-def tame_calibration(
-    *, camera: Size = CAMERA, projector: Size = PROJECTOR_SIZE, focal_px: float = 80.0, sigma: float = 0.1
-) -> Calibration:
-    """A calibration of the tame bench's devices; `sigma` is the deviation of every number."""
-    eye, there = np.eye(3), np.array([-100.0, 0.0, 0.0])
-    lens = np.array([[focal_px, 0.0, 31.5], [0.0, focal_px, 23.5], [0.0, 0.0, 1.0]])
-    volume = np.array([[-40.0, -30.0, 450.0], [40.0, 30.0, 550.0]])
-    solved = SolveRecord("tame", "2026-11-21T11:00:00+00:00", np.eye(30) * sigma**2, volume, 0.02)
-    cameras = {"cam0": Pinhole(camera, lens, np.zeros(5), eye, np.zeros(3))}
-    return Calibration(cameras, Pinhole(projector, lens, np.zeros(5), eye, there), solved)
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,8 +30,8 @@ from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, read_r
 from slrig.jobs.retention import CLOCK, TRASH, Limits, Retention, SteadyClock
 from slrig.jobs.store import Audit
 from slrig.model import Size
-from tests.unit.calibrate.calibration_bench import PNG, CalibrationBench, tame_calibration
-from tests.unit.scan.fakes import WAIT_S
+from tests.unit.calibrate.calibration_bench import PNG, CalibrationBench
+from tests.unit.scan.fakes import WAIT_S, tame_calibration
 
 
 @pytest.fixture
@@ -267,14 +267,15 @@ def used_focal_length(bench: CalibrationBench) -> tuple[str, float]:
 
 
 def test_second_solve_changes_no_calibration_in_use(bench: CalibrationBench) -> None:
+    bench.tame.calibration = tame_calibration(focal_px=82.0)
     session_id = bench.solved()
     bench.calibrations.activate(session_id)
     bench.shot(session_id)
     bench.tame.calibration = tame_calibration(focal_px=81.0)
     assert bench.solve(session_id).solve == 2
-    # The solve was held against the one in use.
-    assert [None if each is None else each.cameras["cam0"].matrix[0, 0] for each in bench.tame.earlier] == [None, 80.0]
-    assert used_focal_length(bench) == (str(session_id), 80.0)
+    # The solve was held against the one in use, the rig's own at first.
+    assert [each and each.cameras["cam0"].matrix[0, 0] for each in bench.tame.earlier] == [80.0, 82.0]
+    assert used_focal_length(bench) == (str(session_id), 82.0)
     bench.calibrations.activate(session_id)
     assert used_focal_length(bench) == (f"{session_id}.2", 81.0)
 

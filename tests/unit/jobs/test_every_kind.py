@@ -28,12 +28,12 @@ from slrig.model_jobs.turntable import TurntableStore
 from slrig.rig.session import ActiveCalibration
 from slrig.scan.plan import PatternPlan
 from tests.unit.accept.test_plan import plan_of
-from tests.unit.calibrate.calibration_bench import BOARD, TameCalibrating, tame_calibration
+from tests.unit.calibrate.calibration_bench import BOARD, TameCalibrating
 from tests.unit.calibrate.health_bench import a_verification
 from tests.unit.jobs.tame_compute import TameCompute
 from tests.unit.model_jobs.model_bench import TameCombining, kept_scan
 from tests.unit.scan.bench import PIPELINE, Bench, failure_code
-from tests.unit.scan.fakes import WAIT_S
+from tests.unit.scan.fakes import WAIT_S, tame_calibration
 from tests.unit.stand_ins import stand_ins
 
 Cancelled = Callable[[], bool]

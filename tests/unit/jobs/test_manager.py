@@ -36,11 +36,10 @@ from slrig.jobs.resume import resume
 from slrig.jobs.store import JobStore
 from slrig.rig.session import ActiveCalibration, RigSession
 from slrig.rig.watchdog import Watchdog
-from tests.unit.calibrate.calibration_bench import tame_calibration
 from tests.unit.jobs.tame_compute import TameCompute
 from tests.unit.jobs.tame_manager import TameManager
 from tests.unit.scan.bench import PIPELINE, Bench, failure_code
-from tests.unit.scan.fakes import WAIT_S, TameProjector, TameRecording
+from tests.unit.scan.fakes import WAIT_S, TameProjector, TameRecording, tame_calibration
 
 REFUSED = JobFailure(PoseRefusedError.code, "hold it still")
 LENT = Holder("measuring 7", "measuring 7", "/measuring/7")
@@ -306,7 +305,7 @@ def test_active_calibration_comes_with_the_rig(bench: Bench) -> None:
     active = ActiveCalibration("spring", tame_calibration())
     bench.manager.rig.use_calibration(active)
     bench.until(measuring(bench, second))
-    assert work.rigs[0].calibration is None
+    assert work.rigs[0].calibration is bench.calibration
     assert second.rigs[0].calibration is active.calibration
     assert bench.manager.status().active is active
 

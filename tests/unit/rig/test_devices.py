@@ -58,7 +58,7 @@ from slrig.rig.watchdog import (
 )
 from tests.unit.capture.fake_rig import CameraFaults, Scene, fake_rig
 from tests.unit.scan.bench import Bench
-from tests.unit.scan.fakes import WAIT_S, TameBench, TameCamera, TameProjector
+from tests.unit.scan.fakes import WAIT_S, TameBench, TameCamera, TameProjector, tame_calibration
 
 
 def failing(error: BaseException) -> Callable[[], None]:
@@ -643,7 +643,7 @@ def test_a_scan_goes_first_and_pictures_go_on_after_it(tmp_path: Path) -> None:
     """On the runner: looking is refused while a scan holds the rig, and yields to one that comes."""
     bench = Bench(tmp_path)
     # The tame capture asks nothing of these cameras, and lights the tame projector.
-    rig = replace(fake_rig().rig, projector=TameProjector())
+    rig = replace(fake_rig().rig, projector=TameProjector(), calibration=tame_calibration())
     bench.manager.rig = RigSession("bench", lambda: rig)
     bench.manager.start()
     try:

@@ -20,7 +20,21 @@ from slrig.doctor import Diagnosis
 from slrig.errors import ScanCancelledError
 from slrig.jobs.job import FrameSink, JobRun, Recording
 from slrig.jobs.worker import Task, job_task
-from slrig.model import Axis, Black, Calibration, CameraFormat, Capture, Frame, Gray, Pattern, Shot, Size, White
+from slrig.model import (
+    Axis,
+    Black,
+    Calibration,
+    CameraFormat,
+    Capture,
+    Frame,
+    Gray,
+    Pattern,
+    Pinhole,
+    Shot,
+    Size,
+    SolveRecord,
+    White,
+)
 from slrig.model.capture import CaptureHeader
 from slrig.scan.job import ScanJob
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
@@ -36,6 +50,22 @@ OUTLINE = CaptureHeader(
 CALIBRATION = Calibration({}, None)
 SHOTS = tuple(Shot(index, "cam0", np.zeros((48, 64), dtype=np.uint8)) for index in range(2))
 EVIDENCE = EvidenceSummary(2, 2, {}, {}, {}, ())
+
+
+CAMERA, PROJECTOR_SIZE = Size(64, 48), Size(64, 40)
+"""Of the tame devices."""
+
+
+def tame_calibration(
+    *, camera: Size = CAMERA, projector: Size = PROJECTOR_SIZE, focal_px: float = 80.0, sigma: float = 0.1
+) -> Calibration:
+    """A calibration of the tame bench's devices; `sigma` is the deviation of every number."""
+    eye, there = np.eye(3), np.array([-100.0, 0.0, 0.0])
+    lens = np.array([[focal_px, 0.0, 31.5], [0.0, focal_px, 23.5], [0.0, 0.0, 1.0]])
+    volume = np.array([[-40.0, -30.0, 450.0], [40.0, 30.0, 550.0]])
+    solved = SolveRecord("tame", "2026-11-21T11:00:00+00:00", np.eye(30) * sigma**2, volume, 0.02)
+    cameras = {"cam0": Pinhole(camera, lens, np.zeros(5), eye, np.zeros(3))}
+    return Calibration(cameras, Pinhole(projector, lens, np.zeros(5), eye, there), solved)
 
 
 class SetClock:
@@ -158,6 +188,7 @@ class TameBench:
 
     def __init__(self) -> None:
         self.order = "finish"
+        self.calibration: Calibration | None = tame_calibration()
         self.recording = TameRecording()
         self.error: Exception | None = None
         self.open_error: Exception | None = None
@@ -195,7 +226,7 @@ class TameBench:
         self.opened.append((camera, projector))
         if len(self.opened) > 1:
             self.opened_again.set()
-        return Rig("bench", {"cam0": camera}, projector, {"cam0": CameraSettings(0.01)})
+        return Rig("bench", {"cam0": camera}, projector, {"cam0": CameraSettings(0.01)}, self.calibration)
 
     def capture(
         self,

@@ -31,6 +31,7 @@ from slrig.errors import (
     DriverNotFoundError,
     InvalidInputError,
     JobNotFoundError,
+    NotCalibratedError,
     PatternError,
     RigBusyError,
     ScanStateError,
@@ -45,9 +46,8 @@ from slrig.model import Calibration
 from slrig.rig.session import ActiveCalibration, RigSession
 from slrig.scan.job import ScanJob, cancel_series, plan_from_json, scans_of, series
 from slrig.scan.plan import PatternPlan, ScanPlan, SeriesPlace, series_of
-from tests.unit.calibrate.calibration_bench import tame_calibration
 from tests.unit.scan.bench import Bench, failure_code
-from tests.unit.scan.fakes import WAIT_S, TameBench
+from tests.unit.scan.fakes import WAIT_S, TameBench, tame_calibration
 
 
 def test_scan_walks_to_its_mesh(bench: Bench) -> None:
@@ -188,6 +188,22 @@ def test_plan_is_held_against_the_open_rig_and_the_free_disk(bench: Bench) -> No
     assert len(bench.store.page(before=None, limit=10)) == 1
     bench.free_bytes = 10**9
     assert bench.until(bench.scan().id).state is JobState.SUCCEEDED
+
+
+def test_nothing_is_shot_by_a_rig_without_calibration(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.calibration = None
+    # Before the rig is open nobody knows.
+    queued = bench.scan()
+    bench.manager.start()
+    record = bench.until(queued.id)
+    assert (record.state, failure_code(record)) == (JobState.FAILED, "not-calibrated")
+    with pytest.raises(NotCalibratedError, match="slrig calibrate run"):
+        bench.scan()
+    assert bench.captured == []
+    bench.manager.rig.use_calibration(ActiveCalibration("spring", tame_calibration()))
+    assert bench.until(bench.scan().id).state is JobState.SUCCEEDED
+    bench.close()
 
 
 def test_delete_removes_record_and_files_once_a_scan_is_over(bench: Bench) -> None:
