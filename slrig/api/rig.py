@@ -59,7 +59,7 @@ from slrig.jobs.records import RIG_JOBS, JobKind, JobRecord, JobState, utc_now
 from slrig.jobs.worker import REQUEST_WAIT_S, Task
 from slrig.model_jobs.job import turntable_planes
 from slrig.model_jobs.turntable import TurntableState, state_of, turntable_svg
-from slrig.rig.preview import Light, Watch
+from slrig.rig.preview import LONGEST_S, Light, Watch
 from slrig.rig.watchdog import SettingsInUse
 from slrig.scan.artefacts import MESH
 
@@ -175,10 +175,19 @@ async def look_through_camera(
     marks: Annotated[
         bool, Query(description="saturated pixels in red, and in white light in blue those that are too dark")
     ] = False,
+    exposure_s: Annotated[
+        float | None,
+        Query(
+            gt=0,
+            le=LONGEST_S,
+            description="of this camera, as near as it can, for all who look, whoever asked last; scans keep theirs. "
+            "Default: the rig file's",
+        ),
+    ] = None,
 ) -> Response:
     """Look through a camera while nobody scans: an `img` element shows it. A scan that comes goes first."""
     held.enter_context(service.streams.take())
-    watch = await run_in_threadpool(service.manager.watch, camera, light)
+    watch = await run_in_threadpool(service.manager.watch, camera, light, exposure_s)
     return StreamingResponse(
         _parts(watch, marked=marks),
         media_type=f"multipart/x-mixed-replace; boundary={_BOUNDARY}",
@@ -187,7 +196,8 @@ async def look_through_camera(
 
 
 async def _parts(watch: Watch, *, marked: bool) -> AsyncIterator[bytes]:
-    number = 0
+    number, lit = 0, watch.light is Light.WHITE
+    make = partial(_shown, marked=marked, lit=lit)
     with watch:
         while True:
             try:
@@ -200,10 +210,13 @@ async def _parts(watch: Watch, *, marked: bool) -> AsyncIterator[bytes]:
                 yield b"\r\n"
                 continue
             number = picture.number
-            shown = marked_picture(picture.image, lit=watch.light is Light.WHITE) if marked else picture.image
-            jpeg = await run_in_threadpool(encoded, shown)
+            jpeg = await run_in_threadpool(picture.made, (marked, lit), make)
             head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
             yield head.encode() + jpeg + b"\r\n"
+
+
+def _shown(image: NDArray[np.uint8], *, marked: bool, lit: bool) -> bytes:
+    return encoded(marked_picture(image, lit=lit) if marked else image)
 
 
 def marked_picture(image: NDArray[np.uint8], *, lit: bool) -> NDArray[np.uint8]:

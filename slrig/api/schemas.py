@@ -430,6 +430,7 @@ class ProjectorBody(BaseModel):
     size_px: Extent
     plays: bool
     latency_s: float
+    refresh_s: float | None = Field(description="of its light: exposures that are whole multiples of it see it steady")
 
 
 class CalibrationInUse(BaseModel):
@@ -453,6 +454,9 @@ class RigBody(BaseModel):
     name: str
     open: bool = Field(description="every device is open and was well when last used")
     error: str | None = Field(description="why it is not open; the next scan tries again")
+    opening: str = Field(description="what its driver told last while it is opened; empty where it told nothing")
+    reconstruction: str = Field(description="ok, or how far the process that computes is, or why it cannot compute")
+    preparing: bool = Field(description="that process is on its way to ok")
     calibrated: bool | None = Field(description="null before the rig was first open")
     calibration: CalibrationInUse | None = Field(description="what scans use now; null where there is none")
     positions: list[str] = Field(description="poses that the rig's positioner can take; none where a person does")

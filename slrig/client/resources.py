@@ -310,13 +310,20 @@ class RigState(Resource):
         self._connection.send("POST", "/rig/reopen")
 
     def pictures(
-        self, camera: str, *, light: Literal["off", "white"] | None = None, marks: bool | None = None
+        self,
+        camera: str,
+        *,
+        light: Literal["off", "white"] | None = None,
+        marks: bool | None = None,
+        exposure_s: float | None = None,
     ) -> Iterator[Picture]:
         """The live picture of a camera, (H, W) or (H, W, 3) uint8, until a scan needs the rig or the caller stops.
 
-        light : what the projector shows; "off" by default. marks : draw saturated pixels and the board.
+        light : what the projector shows; "off" by default. marks : draw saturated pixels, and in white light those that
+        are too dark. exposure_s : of the pictures; the rig file's by default.
         """
-        return self._connection.pictures(path("/preview/{}", camera), params=given(light=light, marks=marks))
+        options = given(light=light, marks=marks, exposure_s=exposure_s)
+        return self._connection.pictures(path("/preview/{}", camera), params=options)
 
 
 class Examinations(Resource):

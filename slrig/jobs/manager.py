@@ -378,8 +378,8 @@ class JobManager:
         self.data.discard(job_id, trash)
         _log.info("job deleted", kind=str(record.kind), job=str(job_id))
 
-    def watch(self, camera: str, light: Light) -> Watch:
-        """Look through a camera; pictures come while the rig is idle.
+    def watch(self, camera: str, light: Light, exposure_s: float | None = None) -> Watch:
+        """Look through a camera; pictures come while the rig is idle. exposure_s : see `Previews.watch`.
 
         Raises
         ------
@@ -406,7 +406,7 @@ class JobManager:
                 raise interruption_error()
             if self._active is not None:
                 raise _busy(self._active)
-        return self._previews.watch(camera, light)
+        return self._previews.watch(camera, light, exposure_s)
 
     def status(self) -> RigStatus:
         """Return who holds the rig, and how it is. Touches no device."""

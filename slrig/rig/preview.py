@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from types import TracebackType
 from typing import Self
@@ -18,7 +18,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.devices import Camera, Rig, Trigger
+from slrig.devices import Camera, CameraSettings, Rig, Trigger
 from slrig.errors import FrameTimeoutError, SlrigError, UnsupportedByDeviceError
 from slrig.model import Frame, White
 from slrig.patterns import encode
@@ -27,6 +27,8 @@ PICTURES_PER_S = 15.0
 _ARMED_FOR = 32  # pictures; some drivers hold a buffer for each
 _TRIES = 3
 _TIMEOUT_S = 1.0
+LONGEST_S = 1.0
+"""No picture is exposed longer: a scan that wants the rig waits for it."""
 
 
 class Light(StrEnum):
@@ -36,20 +38,30 @@ class Light(StrEnum):
     WHITE = "white"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Picture:
     """One picture of a camera. image : (H, W) uint8, 255 at full scale; `number` counts the camera's pictures."""
 
     image: NDArray[np.uint8]
     number: int
+    _made: dict[Hashable, bytes] = field(default_factory=dict)
+    _making: threading.Lock = field(default_factory=threading.Lock)
+
+    def made(self, kind: Hashable, make: Callable[[NDArray[np.uint8]], bytes]) -> bytes:
+        """What is made of the image, of each kind once for all who look, however many they are."""
+        with self._making:
+            if kind not in self._made:
+                self._made[kind] = make(self.image)
+            return self._made[kind]
 
 
 class Watch:
     """Somebody who looks through a camera. Leave the `with` block to look away."""
 
-    def __init__(self, room: Previews, camera: str, light: Light) -> None:
+    def __init__(self, room: Previews, camera: str, light: Light, exposure_s: float | None = None) -> None:
         self.camera = camera
         self.light = light
+        self.exposure_s = exposure_s
         self._room = room
 
     def picture(self, after: int, timeout_s: float) -> Picture | None:
@@ -90,9 +102,11 @@ class Previews:
         with self._changed:
             return bool(self._watches)
 
-    def watch(self, camera: str, light: Light) -> Watch:
-        """Begin to look through a camera."""
-        watch = Watch(self, camera, light)
+    def watch(self, camera: str, light: Light, exposure_s: float | None = None) -> Watch:
+        """Begin to look through a camera. exposure_s : as near as the camera can; None the rig file's. It is the
+        camera's one for all who look: that of whoever asked last.
+        """
+        watch = Watch(self, camera, light, exposure_s)
         with self._changed:
             if not self._watches:
                 # What somebody saw earlier is not what is there now.
@@ -141,15 +155,16 @@ class Previews:
                 asked = self._asked()
                 if not asked:
                     break
-                wanted = Light.WHITE if Light.WHITE in asked.values() else Light.OFF
+                wanted = Light.WHITE if any(each is Light.WHITE for each, _ in asked.values()) else Light.OFF
                 if wanted is not light:
                     light = wanted
                     _set_light(rig, light)
                 for name in [name for name in shown if name not in asked]:
                     shown.pop(name).close()
-                for name in asked:
+                for name, (_, exposure_s) in asked.items():
                     if name not in shown:
                         shown[name] = _CameraPreview(rig, name)
+                    shown[name].expose(exposure_s)
                     frame = shown[name].frame(rig.clock.now_ns())
                     self._put(name, _picture(frame, rig.cameras[name].info.format.full_scale))
                 self._rest(began_s + 1 / PICTURES_PER_S, stop)
@@ -159,13 +174,16 @@ class Previews:
                     each.close()
             rig.projector.blank()
 
-    def _asked(self) -> Mapping[str, Light]:
-        """The cameras that somebody looks through, each with the light that was asked for."""
+    def _asked(self) -> Mapping[str, tuple[Light, float | None]]:
+        """The cameras that somebody looks through, each with the light and the exposure that were asked for."""
         with self._changed:
-            asked: dict[str, Light] = {}
+            asked: dict[str, tuple[Light, float | None]] = {}
             for watch in self._watches:
-                if asked.get(watch.camera) is not Light.WHITE:
-                    asked[watch.camera] = watch.light
+                light, exposure_s = asked.get(watch.camera, (watch.light, None))
+                asked[watch.camera] = (
+                    Light.WHITE if watch.light is Light.WHITE else light,
+                    watch.exposure_s or exposure_s,
+                )
             return asked
 
     def _put(self, camera: str, image: NDArray[np.uint8]) -> None:
@@ -200,8 +218,25 @@ class _CameraPreview:
             )
             raise UnsupportedByDeviceError(message)
         self._trigger = fit[0]
-        if name in rig.settings:
-            self._camera.configure(rig.settings[name])
+        self._own = rig.settings.get(name)
+        self._exposure_s: float | None = None
+        if self._own is not None:
+            self._camera.configure(self._own)
+
+    def expose(self, exposure_s: float | None) -> None:
+        """Use an exposure from the next frame on; None is the rig file's."""
+        if exposure_s == self._exposure_s:
+            return
+        self._exposure_s = exposure_s
+        settings = self._own
+        if exposure_s is not None:
+            least_s, most_s = self._camera.info.exposure_range_s
+            within_s = min(max(exposure_s, least_s), most_s, LONGEST_S)
+            settings = replace(self._own or CameraSettings(within_s), exposure_s=within_s)
+        if settings is not None:
+            self._camera.disarm()
+            self._left = 0
+            self._camera.configure(settings)
 
     def frame(self, after_ns: int) -> Frame:
         """One frame, begun after this instant."""
@@ -218,7 +253,7 @@ class _CameraPreview:
     def _shot(self, after_ns: int) -> Frame:
         if self._trigger is Trigger.SOFTWARE:
             self._camera.trigger()
-        return self._camera.read(after_ns, _TIMEOUT_S)
+        return self._camera.read(after_ns, _TIMEOUT_S + (self._exposure_s or 0.0))
 
     def close(self) -> None:
         self._camera.disarm()

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from structlog.testing import capture_logs
 
 from slrig import failure
@@ -606,6 +607,35 @@ def test_pictures_follow_one_another_and_the_light_that_is_asked_for() -> None:
     room.join()
     assert room.error is None
     assert fake.at_rest
+
+
+def test_the_exposure_is_that_of_whoever_asked_last_within_what_the_camera_can() -> None:
+    fake = fake_rig()
+    room = Room(fake.rig)
+    own_s, camera = fake.rig.settings["left"].exposure_s, fake.cameras["left"]
+    camera.white = camera.scene.white
+    with room.previews.watch("left", Light.WHITE) as first:
+        room.run()
+        usual = next_of(first)
+        with room.previews.watch("left", Light.WHITE, 2 * own_s), room.previews.watch("left", Light.WHITE, 1e-9):
+            assert next_of(first, next_of(first).number + 1).image.mean() < usual.image.mean() / 2
+            assert camera.exposures_s[-1] == camera.info.exposure_range_s[0]
+        next_of(first, next_of(first).number + 1)
+        assert camera.exposures_s[-1] == own_s
+    room.join()
+    assert fake.at_rest
+
+
+def test_a_picture_is_encoded_once_for_all_who_look() -> None:
+    picture, made = Picture(np.zeros((2, 3), np.uint8), 1), []
+
+    def make(image: NDArray[np.uint8]) -> bytes:
+        made.append(image.shape)
+        return b"jpeg"
+
+    assert [picture.made("plain", make) for _ in range(20)] == 20 * [b"jpeg"]
+    picture.made("marked", make)
+    assert made == [(2, 3), (2, 3)]
 
 
 def test_a_job_that_wants_the_rig_gets_it_dark_and_disarmed() -> None:
