@@ -43,6 +43,17 @@ Known = Annotated[float | None, BeforeValidator(plain)]
 IfBusy = Literal["reject", "queue"]
 
 
+Rulers = Annotated[
+    list[Millimetres],
+    Field(
+        min_length=2,
+        max_length=2,
+        description="what the two printed scales of the sheet measure from end to end: the one below the board, and "
+        "the one left of it",
+    ),
+]
+
+
 class BoardRequest(ScheduledBoard):
     """The board that is printed: see `slrig calibrate board`."""
 
@@ -65,11 +76,7 @@ class BoardRequest(ScheduledBoard):
     aspect: Annotated[float, Field(gt=0.9, lt=1.1)] = Field(
         default=1.0, description="a square's height over its width, as measured"
     )
-    measured_mm: Annotated[list[Millimetres], Field(min_length=2, max_length=2)] | None = Field(
-        default=None,
-        description="what the two printed scales of the sheet measure from end to end: the one below the board, and "
-        "the one left of it",
-    )
+    measured_mm: Rulers | None = None
 
 
 class CalibrationRequest(Strict):
@@ -119,6 +126,9 @@ class SolveRequest(Strict):
         default=BoardShape.AUTO,
         description="flat: the board is, for certain; bowed: its bend is solved for; auto: it is taken for bowed where "
         "held-out poses are better with that",
+    )
+    measured_mm: Rulers | None = Field(
+        default=None, description="of a board whose size nobody measured before, as in POST /calibration"
     )
 
 
@@ -173,6 +183,8 @@ class BoardBody(BaseModel):
     dictionary: str | None
     square_sigma: float = Field(description="deviation of the print's width and of its height, over themselves")
     aspect: float = Field(description="a square's height over its width")
+    rulers_mm: tuple[int, int] = Field(description="what the scales below and left of it are printed to measure")
+    measured: bool = Field(description="its size was measured, and is not what some printer made of it")
     title: str
 
 
@@ -536,7 +548,8 @@ def solve_calibration(
     service: Serving, calibration_id: UUID, request: Annotated[SolveRequest, Body(default_factory=SolveRequest)]
 ) -> CalibrationBody:
     """Solve the calibration from its accepted poses. The answer comes at once; `progress` tells how far it is."""
-    return _answered(service, service.calibrations.solve(calibration_id, board_shape=request.board_shape))
+    shape, measured_mm = request.board_shape, request.measured_mm
+    return _answered(service, service.calibrations.solve(calibration_id, board_shape=shape, measured_mm=measured_mm))
 
 
 @router.post("/{calibration_id}/activate", responses=problems(409, 507))

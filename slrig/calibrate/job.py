@@ -57,6 +57,7 @@ from slrig.errors import (
     SlrigError,
     SolveRefusedError,
     UnsupportedByDeviceError,
+    setting,
 )
 from slrig.failure import JobFailure, disk_errors
 from slrig.jobs.data_folder import BUNDLE, DataFolder
@@ -534,17 +535,26 @@ class Calibrations:
 
     # The solve
 
-    def solve(self, session_id: UUID, *, board_shape: BoardShape = BoardShape.AUTO) -> SessionRecord:
+    def solve(
+        self,
+        session_id: UUID,
+        *,
+        board_shape: BoardShape = BoardShape.AUTO,
+        measured_mm: Sequence[float] | None = None,
+    ) -> SessionRecord:
         """Begin to solve a session from its accepted poses. Returns at once.
 
-        board_shape : whether the board may be bowed.
+        board_shape : whether the board may be bowed. measured_mm : what the two printed scales of the board measure,
+        see `Board.as_measured`, where that was not known before.
 
         Raises
         ------
         CalibrationNotFoundError
             There is no such session.
         CalibrationStateError
-            It is being solved, a pose of it is under way, or it was imported.
+            It is being solved, a pose of it is under way, or it was imported. Or its board was measured already.
+        CalibrationError
+            The scales cannot measure that.
         SolveRefusedError
             It has no accepted pose.
         StorageError
@@ -568,6 +578,14 @@ class Calibrations:
                     f"(POST /calibration/{session_id}/pose); GET /calibration/{session_id} tells what to shoot."
                 )
                 raise SolveRefusedError(message)
+            if measured_mm is not None and record.board is not None:
+                if record.board.measured:
+                    message = (
+                        f"The board of calibration {session_id} was measured already: {record.board.title}. Leave out "
+                        f"{setting('measured_mm')}, or open a new calibration."
+                    )
+                    raise CalibrationStateError(message)
+                self.register.change(session_id, board=record.board.as_measured(*measured_mm))
             compared, used = self.store.folder(session_id) / COMPARED, self._comparable(record)
             with disk_errors(compared):
                 compared.unlink(missing_ok=True)

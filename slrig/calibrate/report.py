@@ -648,7 +648,8 @@ def judgement(pose: ReadPose, earlier: Sequence[ReadPose], setting: Setting) -> 
     """Return what to tell of a pose, the accepted ones before it at hand."""
     observations = [each.observation for each in earlier]
     found = check_pose(pose.observation, pose.figures, observations, setting.board, setting.sizes)
-    return Judgement(found.refusals, _fields(found, *_ANSWER), _standing(found.coverage, found.advice))
+    stands = _standing(found.coverage, found.advice, pose.observation)
+    return Judgement(found.refusals, _fields(found, *_ANSWER), stands)
 
 
 def standing(poses: Sequence[ReadPose], setting: Setting) -> SessionGuidance:
@@ -656,7 +657,8 @@ def standing(poses: Sequence[ReadPose], setting: Setting) -> SessionGuidance:
     observations = [each.observation for each in poses]
     guess = estimate_rig(observations, setting.board, setting.sizes)
     covered = coverage(observations, setting.board, setting.sizes, rig=guess)
-    return _standing(covered, advise_pose(observations, setting.board, setting.sizes, rig=guess, covered=covered))
+    advice = advise_pose(observations, setting.board, setting.sizes, rig=guess, covered=covered)
+    return _standing(covered, advice, observations[-1] if observations else None)
 
 
 def summary(result: CalibrationResult) -> Mapping[str, Any]:
@@ -717,11 +719,15 @@ def warm() -> None:
     importlib.import_module("slrig.calibrate.pose_reading")
 
 
-def _standing(found: Coverage, advice: Advice) -> SessionGuidance:
+def _standing(found: Coverage, advice: Advice, last: PoseObservation | None) -> SessionGuidance:
+    """Last : the pose shot last, which tells where the board is now."""
     shown = ("cells", "reachable", "share", "depths", "tilted", "turns", "distance_mm")
     devices = {name: _fields(each, *shown) for name, each in found.devices.items()}
     told = _fields(advice, "enough", "camera", "outline_px", "worst_px", "expected_px")
-    return SessionGuidance({**_fields(found, "poses", "missing"), "devices": devices}, {"words": advice.text, **told})
+    view = None if last is None or advice.camera is None else last.views.get(advice.camera)
+    from_px = None if view is None or not len(view.points_px) else view.points_px.mean(axis=0)
+    next_move = {"words": advice.text, **told, "from_px": plain(from_px)}
+    return SessionGuidance({**_fields(found, "poses", "missing"), "devices": devices}, next_move)
 
 
 def _fields(value: object, *names: str) -> dict[str, Any]:

@@ -172,6 +172,11 @@ class Board:
         )
 
     @property
+    def measured(self) -> bool:
+        """Whether its size was measured, and is not what was printed by some printer."""
+        return self.square_sigma != PRINT_SIGMA or self.aspect != 1
+
+    @property
     def title(self) -> str:
         """Kind, corners and square size.
 

@@ -490,9 +490,15 @@ class CalibrationResource(Resource):
         """Stop the capture of a pose."""
         return self._connection.json("POST", path("/calibration/{}/pose/{}/cancel", calibration_id, number))
 
-    def solve(self, calibration_id: str, *, board_shape: Literal["auto", "flat", "bowed"] | None = None) -> Json:
-        """Solve from all accepted poses."""
-        options = given(board_shape=board_shape)
+    def solve(
+        self,
+        calibration_id: str,
+        *,
+        board_shape: Literal["auto", "flat", "bowed"] | None = None,
+        measured_mm: Sequence[float] | None = None,
+    ) -> Json:
+        """Solve from all accepted poses. measured_mm: both printed scales of the board, where nobody gave them yet."""
+        options = given(board_shape=board_shape, measured_mm=measured_mm)
         return self._connection.json("POST", path("/calibration/{}/solve", calibration_id), json=options)
 
     def activate(self, calibration_id: str) -> Json:

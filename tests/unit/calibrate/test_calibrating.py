@@ -30,7 +30,7 @@ from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, read_r
 from slrig.jobs.retention import CLOCK, TRASH, Limits, Retention, SteadyClock
 from slrig.jobs.store import Audit
 from slrig.model import Size
-from tests.unit.calibrate.calibration_bench import PNG, CalibrationBench
+from tests.unit.calibrate.calibration_bench import BOARD, PNG, CalibrationBench
 from tests.unit.scan.fakes import WAIT_S, tame_calibration
 
 
@@ -220,6 +220,18 @@ def test_rig_without_a_positioner_says_so(bench: CalibrationBench) -> None:
         poses.shoot(bench.session(), PoseRequest(position=0), wait=False)
     with pytest.raises(UnsupportedByDeviceError, match="no positioner"):
         poses.script(bench.session(), (), PoseRequest(), wait=False)
+
+
+def test_a_board_can_be_measured_when_its_poses_are_shot_and_once(bench: CalibrationBench) -> None:
+    session_id = bench.session()
+    bench.shot(session_id)
+    across_mm, down_mm = BOARD.rulers_mm
+    bench.calibrations.solve(session_id, measured_mm=(1.002 * across_mm, down_mm))
+    bench.until_session(session_id, lambda record: record.state is SessionState.SOLVED)
+    used = bench.tame.boards[-1]
+    assert (used, used.square_mm) == (bench.record(session_id).board, pytest.approx(1.002 * BOARD.square_mm))
+    with pytest.raises(CalibrationStateError, match="was measured already"):
+        bench.calibrations.solve(session_id, measured_mm=(across_mm, down_mm))
 
 
 def test_solve_is_refused_until_it_makes_sense(bench: CalibrationBench) -> None:
