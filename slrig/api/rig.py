@@ -100,7 +100,7 @@ def look_at_rig(service: Serving) -> RigBody:
         open=facts is not None and status.fault is None,
         error=status.fault,
         calibrated=None if facts is None else (status.active is not None or facts.calibration is not None),
-        calibration=_in_use(status),
+        calibration=_in_use(service, status),
         positions=[] if facts is None else facts.positions,
         turntable=facts is not None and facts.turntable,
         cameras=[] if facts is None else [_camera(*each, settings.get(each[0])) for each in facts.cameras.items()],
@@ -133,7 +133,7 @@ def _devices(service: Service) -> DeviceList:
     return filled(DeviceList, found, drivers=installed_drivers(), faults=[str(fault) for fault in found.faults])
 
 
-def _in_use(status: RigStatus) -> CalibrationInUse | None:
+def _in_use(service: Service, status: RigStatus) -> CalibrationInUse | None:
     active, facts = status.active, status.facts
     calibration = active.calibration if active is not None else None if facts is None else facts.calibration
     if calibration is None:
@@ -146,7 +146,7 @@ def _in_use(status: RigStatus) -> CalibrationInUse | None:
         solve=None if solved is None else solved.id,
         solved_at=solved_at,
         age_s=None if solved_at is None else round((utc_now() - solved_at).total_seconds(), 1),
-        expected_error_mm=None if solved is None else solved.expected_error_mm,
+        expected_error_mm=service.health.error_mm(calibration),
         error=status.misfit,
     )
 
@@ -375,9 +375,9 @@ class VerificationFigures(BaseModel):
     scale_percent: float | None
     scale_sigma_percent: float | None
     scale_mm: float | None
-    expected_mm: float | None
-    stated_mm: float | None
-    drift_mm: float | None
+    expected_mm: float | None = Field(description="error of a scanned point then, without the board's size")
+    stated_mm: float | None = Field(description="the same after the calibration: the size would hide a change")
+    drift_mm: float | None = Field(description="by how much the likeliest change moves a point; 0 where none is likely")
     drifts: list[DriftEstimate]
     open: str | None = Field(description="what the geometry leaves open")
     unseen: list[str] = Field(description="devices that took no part, of which nothing was learned")
@@ -391,6 +391,10 @@ class HealthBody(BaseModel):
     remedy: str | None
     calibration: str | None
     calibration_age_s: float | None
+    expected_error_mm: float | None = Field(
+        description="of a scanned point now, a standard deviation: that of the solve, the board's size included, and "
+        "what changed since; null if the calibration says nothing of its own error"
+    )
     refuses_scans_when_stale: bool
     thresholds: Thresholds
     latest: VerificationFigures | None
@@ -436,6 +440,7 @@ def look_at_health(service: Serving) -> HealthBody:
         health,
         calibration=None if calibration is None else calibration.solve_id,
         calibration_age_s=age_s,
+        expected_error_mm=None if calibration is None else service.health.error_mm(calibration),
         refuses_scans_when_stale=service.refuse_when_stale,
         thresholds=THRESHOLDS,
         latest=None if latest is None else VerificationFigures.model_validate(latest.document()),

@@ -442,8 +442,8 @@ class CalibrationInUse(BaseModel):
     solved_at: datetime | None
     age_s: float | None
     expected_error_mm: float | None = Field(
-        description="standard deviation of a measured point along the surface normal, from the calibration alone; null "
-        "if it says nothing of its own error"
+        description="of a scanned point now, a standard deviation: that of the solve, the board's size included, and "
+        "what changed since; null if the calibration says nothing of its own error"
     )
     error: str | None = Field(description="why scans are refused with it: it is for other devices")
 

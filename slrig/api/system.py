@@ -103,14 +103,14 @@ class _Figures(Collector):
                 "slrig_last_verification_timestamp_seconds", "When the rig was last verified.", latest.at.timestamp()
             )
         solved = None if calibration is None else calibration.solved
-        if solved is None:
+        if calibration is None or solved is None:
             return
         age_s = (utc_now() - datetime.fromisoformat(solved.solved_at)).total_seconds()
         yield GaugeMetricFamily("slrig_calibration_age_seconds", "Age of the calibration in use.", age_s)
         yield GaugeMetricFamily(
             "slrig_calibration_expected_error_millimetres",
-            "What the calibration in use says of the error of a point in its volume: a standard deviation.",
-            solved.expected_error_mm,
+            "Expected error of a scanned point now, with the board's size and what changed: a standard deviation.",
+            self._service.health.error_mm(calibration) or 0.0,
         )
 
     def _notices(self) -> Iterator[Metric]:

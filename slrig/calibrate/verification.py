@@ -28,6 +28,7 @@ from slrig.calibration.health import (
     Thresholds,
     Verification,
     judge_health,
+    scan_error_mm,
     verification_from_document,
     verification_from_scan,
 )
@@ -157,14 +158,19 @@ def require_healthy(health: Health, *, refuse_when_stale: bool) -> None:
         raise CalibrationStateError(message)
 
 
-def health_stamp(health: Health, latest: VerificationRecord | None) -> dict[str, Any]:
-    """The section `health` of a scan's report: what the rig's health was when it was scanned."""
+def health_stamp(
+    health: Health, latest: VerificationRecord | None, *, calibration: str | None = None, error_mm: float | None = None
+) -> dict[str, Any]:
+    """The section `health` of a scan's report: what the rig's health was when it was scanned. error_mm : see
+    `RigHealth.error_mm`.
+    """
     return {
         "state": str(health.state),
         "reasons": list(health.reasons),
         "verified_at": None if latest is None else latest.at.isoformat(timespec="seconds"),
         "verification": None if latest is None else str(latest.id),
-        "expected_error_mm": None if latest is None else latest.found.expected_mm,
+        "calibration": calibration,
+        "expected_error_mm": error_mm,
     }
 
 
@@ -251,6 +257,14 @@ class HealthStore:
         """The newest verification; None where there is none."""
         return next(iter(self.history(limit=1)), None)
 
+    def last_by_board(self, calibration: str) -> Verification | None:
+        """What the newest verification of a calibration with the board found: a scan's tells no error."""
+        query = select(VerificationRow).where(VerificationRow.calibration == calibration)
+        with self.database.reading() as session:
+            board = query.where(VerificationRow.kind == "board").order_by(VerificationRow.number.desc()).limit(1)
+            found = list(readable(session.scalars(board), _record))
+        return found[0].found if found else None
+
     def since_calibration(self, calibration: str, *, limit: int = 1000) -> Sequence[VerificationRecord]:
         """The verifications of one calibration, oldest first; the newest `limit` of them."""
         query = select(VerificationRow).where(VerificationRow.calibration == calibration)
@@ -292,8 +306,17 @@ class RigHealth:
 
     def stamp(self) -> dict[str, Any] | None:
         """The health now, as a scan's report has it; None where nothing was verified yet."""
-        health, latest, _ = self.health()
-        return None if latest is None else health_stamp(health, latest)
+        health, latest, calibration = self.health()
+        if latest is None or calibration is None:
+            return None
+        error_mm = self.error_mm(calibration)
+        return health_stamp(health, latest, calibration=calibration.solve_id, error_mm=error_mm)
+
+    def error_mm(self, calibration: Calibration) -> float | None:
+        """The expected error of a scanned point with a calibration now: see `scan_error_mm`."""
+        if calibration.solved is None:
+            return None
+        return scan_error_mm(calibration.solved, self.store.last_by_board(calibration.solve_id))
 
     def health(self) -> tuple[Health, VerificationRecord | None, Calibration | None]:
         """The health of the calibration in use, the verification that it rests on, and that calibration."""
@@ -355,20 +378,16 @@ def _moments(records: Records) -> list[datetime]:
 
 
 def _errors(records: Records, at: Thresholds, top: float) -> list[Markup]:
-    errors = [record.found.expected_mm for record in records]
+    # A calibration that says nothing of its own error, and a scan, tell none.
+    errors = [record.found.error_ratio for record in records]
     known = [error for error in errors if error is not None]
-    # A calibration that says nothing of its own error expects none.
-    if not any(known):
-        words = "No verification tells an expected error: they are of scans, or the calibration does not tell its own."
+    if not known:
+        words = "No verification tells a change: they are of scans, or the calibration does not tell its own error."
         return [shape("text", words, x=LEFT, y=top + 20)]
-    stated = next((record.found.stated_mm for record in reversed(records) if record.found.stated_mm), 0.0)
-    panel = Panel(
-        _moments(records), top, max(*known, 1.2 * at.watch_error_ratio * stated), "Expected error of a scan, mm"
-    )
-    if stated:
-        panel.limit(stated, "stated", _COLOURS[HealthState.UNKNOWN])
-        for state, ratio in ((HealthState.WATCH, at.watch_error_ratio), (HealthState.STALE, at.stale_error_ratio)):
-            panel.limit(ratio * stated, f"{state}, {ratio:g} x", _COLOURS[state])
+    panel = Panel(_moments(records), top, max(*known, 1.2 * at.watch_error_ratio), "Change since calibration")
+    panel.limit(1.0, "as calibrated", _COLOURS[HealthState.UNKNOWN])
+    for state, ratio in ((HealthState.WATCH, at.watch_error_ratio), (HealthState.STALE, at.stale_error_ratio)):
+        panel.limit(ratio, f"{state}, {ratio:g} x", _COLOURS[state])
     panel.line(errors, PALE, of=[record.calibration for record in records])
     for record, error in zip(records, errors, strict=True):
         if error is not None:

@@ -8,8 +8,11 @@ import {Action, Badge, Facts, Progress, Refusal, length, moment, percent} from "
 const STATES = {good: ["good", "Good"], watch: ["warn", "Watch"], stale: ["bad", "Stale"], unknown: ["busy", "Not known"]};
 const DAY_S = 86400;
 
-/** The expected error of a scan; null where the calibration says nothing of its own. */
-const error = (verification) => verification?.expected_mm || null;
+/** By how much what changed since the calibration moves a point of a scan; null where a verification does not tell. */
+function change(verification) {
+  const moved_mm = verification?.drift_mm ?? null;
+  return moved_mm === null ? null : moved_mm === 0 ? "none found" : length(moved_mm);
+}
 const hundredths = (percents) => Number(percents.toFixed(3));
 
 export function HealthScreen({rig, may}) {
@@ -37,7 +40,8 @@ function State({health}) {
     <${Facts} of=${[
       ["Last verified", moment(latest?.at)],
       ["Age of the calibration", age_s === null ? null : age_s < DAY_S ? "less than a day" : `${Math.floor(age_s / DAY_S)} days`],
-      ["Expected error of a scan", error(latest) && `${length(latest.expected_mm)}${latest.stated_mm ? ` (stated: ${length(latest.stated_mm)})` : ""}`],
+      ["Expected error of a scan", health.expected_error_mm && length(health.expected_error_mm)],
+      ["Change since calibration", change(latest)],
       ["Board against its print", size === null ? null : `${hundredths(size)}${latest.scale_sigma_percent ? ` ± ${hundredths(latest.scale_sigma_percent)}` : ""} %`],
       ["Scans while it is stale", health.refuses_scans_when_stale ? "refused" : "made, and marked so"],
     ]} />
@@ -122,18 +126,18 @@ function Trend({health}) {
     ${page && records.length === 0 && html`<p class="quiet">Nothing was verified yet. The button above shoots the first.</p>`}
     ${records.length > 0 && html`
       <div class="wide" tabindex="0" role="region" aria-label="Picture of the trend">
-        <img class="trend" src=${`/rig/health.svg?newest=${records[0].id}`} alt="Expected error of a scan, and disagreement of the devices, over time, with their thresholds. The table below has the figures of the last ones." />
+        <img class="trend" src=${`/rig/health.svg?newest=${records[0].id}`} alt="Change since calibration, and disagreement of the devices, over time, with their thresholds. The table below has the figures of the last ones." />
       </div>
-      <p class="quiet">To be watched from ${at.watch_mean_px} px of mean disagreement on, or ${at.watch_error_ratio} times the stated error; stale from ${at.stale_mean_px} px, or ${at.stale_error_ratio} times. Judged by the last three together.</p>
+      <p class="quiet">To be watched from ${at.watch_mean_px} px of mean disagreement on, or ${at.watch_error_ratio} times the error as calibrated (without the board's size); stale from ${at.stale_mean_px} px, or ${at.stale_error_ratio} times. Judged by the last three together.</p>
       <div class="wide" tabindex="0" role="region" aria-label="Last verifications">
         <table class="broad"><caption>Last verifications</caption>
-          <thead><tr>${["When", "State", "By", "Expected error", "Largest mean disagreement", "Why"].map((head) => html`<th scope="col">${head}</th>`)}</tr></thead>
+          <thead><tr>${["When", "State", "By", "Change since calibration", "Largest mean disagreement", "Why"].map((head) => html`<th scope="col">${head}</th>`)}</tr></thead>
           <tbody>${records.map((record) => {
             const [largest_px, pair] = mean(record) ?? [];
             return html`<tr key=${record.id}>
               <td>${moment(record.at)}</td><td><${Badge} kind=${STATES[record.state][0]}>${STATES[record.state][1]}<//></td>
               <td>${record.kind === "scan" ? "a scan" : "the board"}</td>
-              <td>${error(record) === null ? "not told" : length(record.expected_mm)}</td>
+              <td>${change(record) ?? "not told"}</td>
               <td>${pair ? `${largest_px.toFixed(3)} px (${pair.first}, ${pair.second})` : "not told"}</td>
               <td>${record.reasons.join("; ")}</td></tr>`;
           })}</tbody>

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle import read_description
+from slrig.bundle import read_description, read_health
 from slrig.capture import EvidenceSummary
 from slrig.meshing import MeshStage, SurfaceMesh
 from slrig.model import (
@@ -313,6 +313,7 @@ def calibration_report(
     where the calibration does not state its error. Then only `id` is known, a digest of its numbers, and `absent` says
     why.
 
+    `expected_error_mm` is that of the solve, or what it was when the scan was made (see `scan_error_mm`).
     `sigma_share` is the calibration's fraction of a vertex's variance, the median. `age_days` counts from the solve to
     the capture, and is null where one of the two instants is not known.
     """
@@ -330,11 +331,13 @@ def calibration_report(
         share = (calibration_sigma_mm / sigma_mm.astype(np.float64)) ** 2
     known = np.isfinite(share)
     age_days, words = _age(solved, bundle)
+    health = read_health(bundle) or {}
+    then_mm = health.get("expected_error_mm") if health.get("calibration") == solved.id else None
     report: dict[str, Any] = {
         "id": solved.id,
         "solved_at": solved.solved_at,
         "age_days": age_days,
-        "expected_error_mm": solved.expected_error_mm,
+        "expected_error_mm": then_mm or solved.expected_error_mm,
         "sigma_share": float(np.median(share[known])) if known.any() else None,
         "sigma_calibration_mm": float(np.median(calibration_sigma_mm[known])) if known.any() else None,
     }

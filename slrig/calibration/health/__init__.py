@@ -12,6 +12,7 @@ from slrig.calibration.health.state import (
     Thresholds,
     Verification,
     judge_health,
+    scan_error_mm,
     verification_from_document,
     verification_from_scan,
 )
@@ -25,6 +26,7 @@ __all__ = [
     "Thresholds",
     "Verification",
     "judge_health",
+    "scan_error_mm",
     "verification_from_document",
     "verification_from_scan",
 ]

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from slrig.calibration.solution import device_title
+from slrig.model import SolveRecord
 
 _RECENT = 3
 _CHANCE_SIGMAS = 4.0
@@ -73,10 +74,11 @@ class Verification:
     """Result of one verification, with JSON values throughout; NaN is None.
 
     scale_percent, scale_mm : excess of the board's measured size over its true one, and that of its diagonal; None for
-    a scan. expected_mm : current error of a point along the viewing ray; stated_mm : as stated by the calibration;
-    drift_mm : from the change alone. drifts : likeliest first, empty if nothing changed. open : explanations that the
-    geometry cannot rule out. remedy : what to do about the first. unseen : devices without observations: cameras that
-    did not see the board, and the projector if no camera saw its light there.
+    a scan. expected_mm : current error of a point along the viewing ray, and stated_mm : after the calibration, both
+    without the board's size, which would hide a change (see `scan_error_mm`); drift_mm : from the change alone.
+    drifts : likeliest first, empty if nothing changed. open : explanations that the geometry cannot rule out. remedy :
+    what to do about the first. unseen : devices without observations: cameras that did not see the board, and the
+    projector if no camera saw its light there.
     """
 
     kind: str
@@ -93,6 +95,11 @@ class Verification:
     open: str | None = None
     remedy: str | None = None
     unseen: Sequence[str] = ()
+
+    @property
+    def error_ratio(self) -> float | None:
+        """The current error over that after the calibration, both without the board's size; None where untold."""
+        return self.expected_mm / self.stated_mm if self.expected_mm is not None and self.stated_mm else None
 
     def document(self) -> dict[str, Any]:
         """Fields as JSON values."""
@@ -166,6 +173,17 @@ def verification_from_scan(pairs: Sequence[Mapping[str, Any]], /) -> Verificatio
     return Verification(kind="scan", pairs=found) if found else None
 
 
+def scan_error_mm(solved: SolveRecord | None, found: Verification | None, /) -> float | None:
+    """The expected error of a scanned point now, mm: that of the solve, the board's size included, with what has
+    changed since by the last verification with the board. None where the calibration says nothing of its own error.
+    """
+    if solved is None:
+        return None
+    now_mm, stated_mm = (found.expected_mm, found.stated_mm) if found is not None else (None, None)
+    grown = 0.0 if now_mm is None or stated_mm is None else max(now_mm**2 - stated_mm**2, 0.0)
+    return math.sqrt(solved.expected_error_mm**2 + grown)
+
+
 def judge_health(verifications: Sequence[Verification], /) -> Health:
     """Judge a calibration by all verifications since it was made, oldest first."""
     if not verifications:
@@ -198,19 +216,21 @@ def judge_health(verifications: Sequence[Verification], /) -> Health:
 
 
 def _error_reasons(verifications: Sequence[Verification]) -> _Reasons:
-    limits, known = THRESHOLDS, [each for each in verifications if each.expected_mm is not None and each.stated_mm]
+    limits, known = THRESHOLDS, [each for each in verifications if each.error_ratio is not None]
     if not known:
         return []
     ratio, jumped = _recent_value(
-        [_error_ratio(each) for each in known], jumps=known[-1].evidence > limits.jump_evidence
+        [each.error_ratio or 0.0 for each in known], jumps=known[-1].evidence > limits.jump_evidence
     )
     counted = known[-1:] if jumped else known
     evidence, sigmas = (
         _recent_median([each.evidence for each in counted]),
         _recent_median([each.significance for each in counted]),
     )
-    now, stated = known[-1].expected_mm, known[-1].stated_mm
-    reason = f"scans are now expected to be wrong by {now:.3g} mm, {ratio:.1f} times the stated {stated:.3g} mm"
+    reason = (
+        "something changed since the calibration: without the board's size, the expected error of a scan is "
+        f"{ratio:.1f} times what it was"
+    )
     likely, certain = evidence > limits.watch_evidence, sigmas > limits.sure_sigmas
     if (ratio > limits.stale_error_ratio and likely) or (ratio > limits.sure_error_ratio and certain):
         return [(HealthState.STALE, reason)]
@@ -281,11 +301,6 @@ def _recent_value(values: Sequence[float], *, jumps: bool) -> tuple[float, bool]
     return (values[-1], True) if values[-1] > median and jumps else (median, False)
 
 
-def _error_ratio(verification: Verification) -> float:
-    now, stated = verification.expected_mm, verification.stated_mm
-    return now / stated if now is not None and stated else 0.0
-
-
 def _recent_pairs(verifications: Sequence[Verification]) -> dict[tuple[str, str], None]:
     """Pairs of the last three verifications, in order."""
     return dict.fromkeys((pair.first, pair.second) for each in verifications[-_RECENT:] for pair in each.pairs)
@@ -294,8 +309,8 @@ def _recent_pairs(verifications: Sequence[Verification]) -> dict[tuple[str, str]
 def _describe_good(verification: Verification) -> str:
     worst = max((abs(pair.mean_px) for pair in verification.pairs), default=float("nan"))
     description = f"devices agree within {worst:.2f} px in the mean"
-    if verification.expected_mm is not None and verification.stated_mm:
-        description = f"expected error {verification.expected_mm:.3g} mm, stated {verification.stated_mm:.3g} mm"
+    if verification.error_ratio is not None:
+        description = "a change too small to matter was found" if verification.drift_mm else "no change was found"
     return f"the calibration holds: {'; '.join([description, *_describe_unseen(verification)])}"
 
 

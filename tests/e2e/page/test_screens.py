@@ -133,7 +133,7 @@ def test_a_person_verifies_and_has_it_done_each_night(start: Start, tmp_path: Pa
     state.get_by_role("status").get_by_text("Good").wait_for()
     state.get_by_text("just now").wait_for()
     count(page.get_by_role("table", name="Last verifications").get_by_role("row"), 2)
-    picture = page.get_by_role("img", name="Expected error of a scan")
+    picture = page.get_by_role("img", name="Change since calibration")
     assert picture.evaluate("(image) => image.decode().then(() => image.naturalWidth)") > 0
     assert violations(page) == []
     looks_as_kept(page, "health")

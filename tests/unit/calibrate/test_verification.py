@@ -188,11 +188,23 @@ def test_a_stale_rig_refuses_scans_if_its_file_says_so() -> None:
 
 def test_a_scan_is_stamped_with_the_health_of_its_time(store: HealthStore) -> None:
     record = store.add(a_verification(), calibration=CALIBRATION.solve_id, at=hours(2))
-    stamp = health_stamp(record.health, record)
+    stamp = health_stamp(record.health, record, calibration="one", error_mm=0.04)
+    assert (stamp["calibration"], stamp["expected_error_mm"]) == ("one", 0.04)
     assert stamp["state"] == "good"
     assert stamp["verification"] == str(record.id)
     assert stamp["verified_at"] == "2026-11-20T10:00:00+00:00"
     assert health_stamp(Health(HealthState.UNKNOWN, ()), None)["verified_at"] is None
+
+
+def test_the_last_look_at_the_board_tells_the_error_when_scans_came_after_it(store: HealthStore) -> None:
+    board = a_verification(3.0)
+    store.add(board, calibration="one", at=hours(1))
+    store.add(replace(board, kind="scan", expected_mm=None, stated_mm=None), calibration="one", at=hours(2))
+    store.add(a_verification(), calibration="two", at=hours(3))
+    found = store.last_by_board("one")
+    assert found is not None
+    assert found.expected_mm == 0.03
+    assert store.last_by_board("none") is None
 
 
 def test_history_is_newest_first_limited_and_since(store: HealthStore) -> None:
@@ -264,7 +276,7 @@ def test_every_verification_is_a_dot_in_the_colour_of_its_state() -> None:
 
 def test_thresholds_and_the_recalibration_are_named() -> None:
     texts = [text.text for text in parsed(health_svg(warm_up())).iter(f"{_SVG}text")]
-    for words in ("stated", "watch, 1.4 x", "stale, 3 x", "watch (mean)", "stale (mean)"):
+    for words in ("as calibrated", "watch, 1.4 x", "stale, 3 x", "watch (mean)", "stale (mean)"):
         assert words in texts
     assert texts.count("calibrated") == 1
     assert health_svg(warm_up()).count('stroke-dasharray="2 3"') == 1, "a line where it was calibrated again"
@@ -278,6 +290,6 @@ def test_thresholds_and_the_recalibration_are_named() -> None:
 def test_a_calibration_that_states_no_error_has_no_axis_of_it() -> None:
     record = warm_up()[0]
     silent = replace(record, found=replace(record.found, expected_mm=0.0, stated_mm=None))
-    assert "No verification tells an expected error" in health_svg([silent])
-    assert "Expected error of a scan, mm" not in health_svg([silent])
-    assert "No verification tells an expected error" not in health_svg([silent, record])
+    assert "No verification tells a change" in health_svg([silent])
+    assert "Change since calibration" not in health_svg([silent])
+    assert "No verification tells a change" not in health_svg([silent, record])

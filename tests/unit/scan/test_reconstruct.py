@@ -23,7 +23,7 @@ from slrig.bundle import BundleWriter, read_bundle, read_calibration, write_bund
 from slrig.bundle.description import read_description
 from slrig.bundle.images import read_with_colour as read_frame_pages
 from slrig.bundle.reading import MAX_READERS, open_bundle
-from slrig.bundle.sidecars import TurntableAngle, write_notes, write_turntable_angle
+from slrig.bundle.sidecars import TurntableAngle, write_health, write_notes, write_turntable_angle
 from slrig.capture.verifier import check_capture
 from slrig.config import read_rig
 from slrig.discovery import open_rig
@@ -636,6 +636,17 @@ def test_every_vertex_states_its_share(recorded: Path, read: Read, solved: Read)
     write_converted(output, "mesh.stl")
     write_converted(read[0], "mesh.stl")
     assert (output / "mesh.stl").read_bytes() == (read[0] / "mesh.stl").read_bytes()
+
+
+@pytest.mark.parametrize(("of", "error_mm"), [("solve-7", 0.05), ("another", 0.0123)])
+def test_the_report_has_the_expected_error_as_it_was_then(
+    of: str, error_mm: float, recorded: Path, tmp_path: Path
+) -> None:
+    shutil.copyfile(recorded / "bundle.json", tmp_path / "bundle.json")
+    write_health(tmp_path, {"calibration": of, "expected_error_mm": 0.05})
+    calibration = stating(read_calibration(recorded / "calibration.json"))
+    told = calibration_report(calibration, tmp_path, np.ones(3, dtype=np.float32), np.ones(3))
+    assert told["expected_error_mm"] == error_mm
 
 
 def test_a_calibration_that_says_nothing_of_its_error_has_an_id_and_words(recorded: Path) -> None:

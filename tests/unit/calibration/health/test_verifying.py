@@ -16,6 +16,7 @@ from slrig.calibration.health import (
     PairFigures,
     Verification,
     judge_health,
+    scan_error_mm,
     verification_from_document,
     verification_from_scan,
 )
@@ -23,7 +24,7 @@ from slrig.calibration.health.drift import Change
 from slrig.calibration.health.verification import verify_by_board
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import CalibrationError
-from slrig.model import Calibration, Pinhole
+from slrig.model import Calibration, Pinhole, SolveRecord
 from tests.unit.calibration.health.drifting import (
     BOARD,
     Bench,
@@ -236,6 +237,19 @@ def figures(
     pair = PairFigures("left", PROJECTOR, 2000, mean_px, rms_px, 0.04, 0.002)
     return Verification("board", (pair,), expected_mm=0.01 * error_ratio, stated_mm=0.01, significance=evidence**0.5,
                 evidence=evidence)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("ratio", "error_mm"),
+    [(None, 0.039), (1.0, 0.039), (0.9, 0.039), (3.0, (0.039**2 + 0.03**2 - 0.01**2) ** 0.5)],
+)
+def test_the_error_of_a_scan_is_that_of_the_solve_until_something_changes(ratio: float | None, error_mm: float) -> None:
+    """With the board's size, which verifications leave out."""
+    volume = np.array([[0.0, 0.0, 400.0], [100.0, 100.0, 500.0]])
+    solved = SolveRecord("one", "2026-11-21T11:00:00+00:00", np.eye(15), volume, 0.039)
+    found = None if ratio is None else figures(ratio)
+    assert scan_error_mm(solved, found) == pytest.approx(error_mm)
+    assert scan_error_mm(None, found) is None
 
 
 def test_nothing_verified_is_unknown() -> None:
