@@ -367,7 +367,7 @@ def test_a_file_of_several_scans_comes_as_one_zip(
         client.patch(scan["links"]["self"], json={"label": label})
     asked: dict[str, Any] = {"scan": [each["id"] for each in (first, second, third, first)], "file": "mesh.stl"}
     with monkeypatch.context() as patched:
-        patched.setattr(clouds, "LONGEST_WAIT_S", -1.0)
+        patched.setattr(clouds, "REQUEST_WAIT_S", -1.0)
         later = client.get("/scan/files.zip", params=asked)
         assert (later.status_code, later.headers["Retry-After"]) == (503, "5")
     answer = client.get("/scan/files.zip", params=asked)
