@@ -35,7 +35,7 @@ class ScheduleRequest(Strict):
     )
     task: Annotated[TaskKind, Field(strict=False)] = Field(
         description="verification: does the calibration still hold; calibration: every pose of a positioner, then a "
-        "solve; acceptance: the prescribed artefacts"
+        "solve; acceptance: the prescribed artefacts; scan: one scan"
     )
     options: dict[str, Any] = Field(default_factory=dict, description="of the task, as its own request has them")
     label: FreeText | None = None

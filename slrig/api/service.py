@@ -20,9 +20,10 @@ from pydantic import BaseModel
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from slrig.accept.job import AcceptanceTests
+from slrig.api.schemas import ScanRequest, scan_plan
 from slrig.api.shares import Makings, Shares
 from slrig.calibrate.job import CalibrationArchive, Calibrations
-from slrig.calibrate.verification import RigHealth
+from slrig.calibrate.verification import RigHealth, require_healthy
 from slrig.catalogue.store import Copier, catalogue_of, standing
 from slrig.config import RigConfig, ServiceSettings
 from slrig.discovery import DeviceSearch
@@ -46,9 +47,10 @@ from slrig.jobs.store import Audit, AuditEntry, JobStore, RequestKeys
 from slrig.model_jobs.job import MODELS, TURNTABLE, Models, ViewShooting
 from slrig.model_jobs.turntable import TurntableStore
 from slrig.plugins import OBSERVERS, load, plugin_errors
+from slrig.scan.job import ScanJob
 from slrig.scan.plan import Presets
 from slrig.schedule.notices import NoticedHealth, Receivers, tell_run
-from slrig.schedule.scheduler import Scheduler, Tasks
+from slrig.schedule.scheduler import ScanTask, Scheduler, Tasks
 from slrig.schedule.store import ScheduledRun, ScheduleStore
 
 _ANSWER_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
@@ -242,8 +244,9 @@ class Service:
             clock,
         )
         self.schedules = ScheduleStore(database, notice=partial(tell_run, outbox))
+        scans = ScanTask(manager, self._usual_scan, self._require_healthy)
         self.tasks = Tasks(
-            manager, self.calibrations, self.acceptance, tidy=partial(self.retention.look, "calibration")
+            manager, self.calibrations, self.acceptance, scans, tidy=partial(self.retention.look, "calibration")
         )
         # The folder's lock keeps every other process out.
         self.scheduler = Scheduler(self.schedules, self.tasks, alone=True)
@@ -267,6 +270,13 @@ class Service:
         place = self.manager.kinds[kind].place_of(self.store.get(job_id, kind), self.folder)
         keep = partial(self.folder.relabel, job_id, place, label)
         return self.store.rename(job_id, kind, label=label, keep=keep)
+
+    def _usual_scan(self, preset: str | None) -> ScanJob:
+        found = None if preset is None else self.presets.get(preset)
+        return ScanJob(scan_plan(ScanRequest(preset=preset), self.scan_defaults, found))
+
+    def _require_healthy(self) -> None:
+        require_healthy(self.health.health()[0], refuse_when_stale=self.refuse_when_stale)
 
     def _copier(self) -> Copier | None:
         """What tells the catalogue of this rig, if the settings name one. Raises ConfigError, ExtraMissingError."""

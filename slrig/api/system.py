@@ -5,15 +5,17 @@ from __future__ import annotations
 import base64
 import hashlib
 import importlib.metadata
+import os
 import platform
 import re
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
+from zoneinfo import ZoneInfo
 
 from fastapi import APIRouter, Response
 from fastapi import Path as PathParameter
@@ -162,19 +164,26 @@ class ServiceBody(BaseModel):
     python: str
     free_bytes: int
     total_bytes: int
+    time_zone: str = Field(description="of the service's machine: a name of the IANA database")
+    checks: dict[str, str] = Field(description="what a scan needs, each ok or its fault, as GET /readyz has it")
+    pending: list[str] = Field(description="which of them are not ready yet and get there by themselves")
     spare_bytes: int = Field(description="below so much free space nothing new is begun")
     damaged: dict[JobKind, int] = Field(description="jobs whose record or files are damaged, by kind")
 
 
 @router.get("/service")
 def look_at_service(service: Serving) -> ServiceBody:
-    """Return the version of the service, the space on its disk, and how many jobs are damaged."""
+    """Return the service's version, whether it could scan, the space on its disk, and how many jobs are damaged."""
+    checks, pending = _checks(service)
     disk = shutil.disk_usage(service.folder.root)
     return ServiceBody(
         version=importlib.metadata.version("slrig"),
         python=platform.python_version(),
         free_bytes=disk.free,
         total_bytes=disk.total,
+        time_zone=_time_zone(),
+        checks=checks,
+        pending=pending,
         spare_bytes=service.settings.min_free_bytes,
         damaged=service.store.damaged(),
     )
@@ -198,6 +207,16 @@ async def readyz(service: Probed) -> Response | Probe:
 
 
 def _ready(service: Service) -> Response | Probe:
+    checks, pending = _checks(service)
+    if all(found == "ok" for found in checks.values()):
+        return Probe(checks=checks)
+    wrong = "; ".join(f"{name}: {found}" for name, found in checks.items() if found != "ok")
+    detail = f"The service runs and cannot scan: {wrong}"
+    return answer(problem(503, "not-ready", detail, checks=checks, pending=pending))
+
+
+def _checks(service: Service) -> tuple[dict[str, str], list[str]]:
+    """What a scan needs, and which of that gets ready by itself."""
     status = service.manager.status()
     checks = {
         "records": _storage(service.store.check),
@@ -206,13 +225,18 @@ def _ready(service: Service) -> Response | Probe:
         "reconstruction": status.reconstruction,
         "threads": _threads(service.dead_threads()),
     }
-    if all(found == "ok" for found in checks.values()):
-        return Probe(checks=checks)
-    wrong = "; ".join(f"{name}: {found}" for name, found in checks.items() if found != "ok")
     opening = status.facts is None and status.fault is None and not status.ending
-    pending = [name for name, waits in (("rig", opening), ("reconstruction", status.preparing)) if waits]
-    detail = f"The service runs and cannot scan: {wrong}"
-    return answer(problem(503, "not-ready", detail, checks=checks, pending=pending))
+    return checks, [name for name, waits in (("rig", opening), ("reconstruction", status.preparing)) if waits]
+
+
+@cache
+def _time_zone() -> str:
+    """The name of this machine's time zone; UTC where it has none."""
+    name = os.environ.get("TZ", "").removeprefix(":") or str(Path("/etc/localtime").resolve()).partition("zoneinfo/")[2]
+    try:
+        return ZoneInfo(name).key
+    except (KeyError, ValueError, OSError):
+        return "UTC"
 
 
 @router.get("/problems/{name}")

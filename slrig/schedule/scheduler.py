@@ -16,7 +16,7 @@ from slrig.accept.evaluation import verdicts
 from slrig.accept.job import AcceptanceTests
 from slrig.accept.plan import AcceptanceRequest
 from slrig.accept.store import AcceptanceState
-from slrig.bundle import FreeText, Strict, describe_errors, model_keys
+from slrig.bundle import FreeText, PresetName, Strict, describe_errors, model_keys
 from slrig.calibrate.job import Calibrations, PoseRequest
 from slrig.calibrate.store import SessionState
 from slrig.calibrate.verification import VerificationJob
@@ -26,6 +26,7 @@ from slrig.errors import (
     CalibrationNotFoundError,
     CalibrationStateError,
     DeviceError,
+    PresetNotFoundError,
     RigBusyError,
     ScanCancelledError,
     ScanInterruptedError,
@@ -37,8 +38,9 @@ from slrig.errors import (
     WorkerLostError,
 )
 from slrig.failure import LastingThread, error_of, job_failure
+from slrig.jobs.job import Job
 from slrig.jobs.manager import JobManager
-from slrig.jobs.records import Clock, Holder, JobState, acting_as, utc_now
+from slrig.jobs.records import Clock, Holder, JobRecord, JobState, acting_as, utc_now
 from slrig.jobs.store import JobStore
 from slrig.rig.session import RigFacts
 from slrig.schedule.store import RunState, Schedule, ScheduledRun, ScheduleSpec, ScheduleStore, TaskKind
@@ -237,6 +239,13 @@ class VerificationOptions(Strict):
     exposure_s: ExposureSeconds | None = None
 
 
+class ScanOptions(Strict):
+    """Of a scan. preset None : as the rig is set."""
+
+    preset: PresetName | None = None
+    label: FreeText | None = None
+
+
 class CalibrationOptions(Strict):
     """Of a full set of poses with its solve. positions none : all of them. activate : have scans use what came of it,
     unless its verdict leaves that to a person.
@@ -330,6 +339,43 @@ class Stop:
             unwatch()
 
 
+def done(manager: JobManager, job: Job, holder: Holder, stop: Stop, *, label: str | None = None) -> JobRecord:
+    """The record of a job once it has succeeded. Raises what it failed with; RigBusyError before it began."""
+    jobs, job_id = manager.store, manager.submit(job, label=label, holder=holder)[0].id
+    stop.wait(jobs, job_id, lambda: jobs.get(job_id).state.final, cancel=lambda: manager.cancel(job_id))
+    over = jobs.get(job_id)
+    if over.fault is not None:
+        raise error_of(over.fault)
+    return over
+
+
+class ScanTask:
+    """One scan, as the rig or a preset has it. job : makes it, of a preset's name."""
+
+    options = ScanOptions
+
+    def __init__(
+        self, manager: JobManager, job: Callable[[str | None], Job], require_healthy: Callable[[], None]
+    ) -> None:
+        self._manager = manager
+        self._job = job
+        self._require_healthy = require_healthy
+
+    def check(self, asked: ScanOptions, /) -> None:
+        """See `Task`."""
+        try:
+            self._job(asked.preset)
+        except PresetNotFoundError as error:
+            message = f"options: {error}"
+            raise ScheduleError(message) from error
+
+    def do(self, holder: Holder, asked: ScanOptions, /, *, stop: Stop) -> Mapping[str, Any]:
+        """See `Task`."""
+        self._require_healthy()
+        scan = done(self._manager, self._job(asked.preset), holder, stop, label=asked.label)
+        return {"scan": str(scan.id), "points": ((scan.summary or {}).get("mesh") or {}).get("points")}
+
+
 class VerificationTask:
     """The board shot where it is, or where the positioner takes it, and judged."""
 
@@ -347,13 +393,8 @@ class VerificationTask:
 
     def do(self, holder: Holder, asked: VerificationOptions, /, *, stop: Stop) -> Mapping[str, Any]:
         """See `Task`. A rig that is found stale is a verification that succeeded."""
-        manager, jobs = self._manager, self._manager.store
-        job = manager.submit(VerificationJob(self._board(asked), asked.position, asked.exposure_s), holder=holder)[0].id
-        stop.wait(jobs, job, lambda: jobs.get(job).state.final, cancel=lambda: manager.cancel(job))
-        over = jobs.get(job)
-        if over.fault is not None:
-            raise error_of(over.fault)
-        found = over.summary or {}
+        job = VerificationJob(self._board(asked), asked.position, asked.exposure_s)
+        found = done(self._manager, job, holder, stop).summary or {}
         return {"verification": found["id"], **{name: found.get(name) for name in _TOLD}}
 
     def _board(self, asked: VerificationOptions) -> Board:
@@ -552,6 +593,7 @@ class Tasks:
         manager: JobManager,
         calibrations: Calibrations,
         acceptance: AcceptanceTests,
+        scan: ScanTask,
         *,
         tidy: Callable[[], object] = lambda: None,
     ) -> None:
@@ -560,6 +602,7 @@ class Tasks:
             TaskKind.VERIFICATION: VerificationTask(manager, calibrations),
             TaskKind.CALIBRATION: CalibrationTask(manager, calibrations, tidy),
             TaskKind.ACCEPTANCE: AcceptanceTask(manager, acceptance),
+            TaskKind.SCAN: scan,
         }
         self._lock = threading.Lock()
         self._ended = False

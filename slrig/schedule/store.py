@@ -112,12 +112,13 @@ class TaskKind(StrEnum):
     """What a schedule does with the rig.
 
     VERIFICATION looks whether the calibration still holds; CALIBRATION shoots every pose of a positioner and solves;
-    ACCEPTANCE measures the prescribed artefacts.
+    ACCEPTANCE measures the prescribed artefacts; SCAN scans once.
     """
 
     VERIFICATION = "verification"
     CALIBRATION = "calibration"
     ACCEPTANCE = "acceptance"
+    SCAN = "scan"
 
 
 @dataclass(frozen=True, slots=True)

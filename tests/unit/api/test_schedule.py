@@ -175,6 +175,19 @@ def test_paused_schedule_runs_on_request(client: TestClient, served: ServedBench
     assert client.get(made["links"]["self"]).json()["enabled"] is False
 
 
+def test_scan_is_made_by_the_clock(client: TestClient) -> None:
+    wrong = {**ORDER, "task": "scan", "options": {"preset": "none-such"}}
+    assert refusal(client, "POST", "/schedule", json=wrong) == (422, "/problems/schedule")
+    links = added(client, task="scan", options={"label": "by the clock"})["links"]
+    assert client.post(links["run"]).status_code == 202
+    deadline_s = time.monotonic() + WAIT_S
+    while (run := client.get(links["runs"]).json()["runs"][0])["state"] in {"waiting", "running"}:
+        assert time.monotonic() < deadline_s
+        threading.Event().wait(0.01)
+    assert run["state"] == "succeeded", run
+    assert client.get(f"/scan/{run['result']['scan']}").json()["label"] == "by the clock"
+
+
 def test_metrics_show_scans_schedules_and_the_calibration(client: TestClient, served: ServedBench) -> None:
     made = added(client)
     served.held(client)

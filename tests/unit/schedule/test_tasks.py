@@ -51,7 +51,7 @@ class TaskBench(CalibrationBench):
         self.manager.groups[JobKind.VERIFICATION] = RigHealth(self.manager.rig, self.health, self.folder)
         self.tidied: list[int] = []
         self.tasks = Tasks(
-            self.manager, self.calibrations, AcceptanceTests(self.manager),
+            self.manager, self.calibrations, AcceptanceTests(self.manager), cast("Any", None),
             tidy=lambda: self.tidied.append(len(self.calibrations.latest())),
         )  # fmt: skip
 
@@ -268,7 +268,7 @@ def test_run_holds_the_rig_in_the_name_of_its_schedule_until_it_is_cancelled(ben
 def test_acceptance_is_measured_by_script_and_gives_its_decision(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(AcceptanceRequest, "plan", lambda *_: PLAN)
     schedule, run = scheduled(TaskKind.ACCEPTANCE, {})
-    tasks = Tasks(desk.manager, cast("Any", None), desk)
+    tasks = Tasks(desk.manager, cast("Any", None), desk, cast("Any", None))
     told = tasks(schedule, run)
     assert desk.manager.holders == [HOLDER.format("acceptance")] * len(PLAN.steps)
     assert told["decision"] == "passes"
