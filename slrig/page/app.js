@@ -7,7 +7,7 @@ import {HealthScreen} from "./health.js";
 import {ModelsScreen} from "./models.js";
 import {ResultScreen} from "./result.js";
 import {ScanScreen} from "./scan.js";
-import {ask, useAction, useValue, watchProblems} from "./service.js";
+import {ask, entered, useAction, useValue, watchProblems} from "./service.js";
 import {Action, Badge, Refusal, usePlace} from "./ui.js";
 
 const SCREENS = [
@@ -24,8 +24,13 @@ function Page() {
   const [lost, setLost] = useState(false);
   useEffect(() => watchProblems((problem) => {
     setLost(problem?.status === 0);
-    if (problem?.status === 401) setSession((before) => (before === null || before === "none" ? "none" : "over"));
+    // What was typed stays behind the form until somebody is let in again.
+    if (problem?.status === 401) setSession((before) => (before === null || before === "none" ? "none" : {...before, over: true}));
   }), []);
+  const enter = (opened) => {
+    setSession(opened);
+    entered();
+  };
   const look = () => ask("GET", "/session").then(setSession, () => {});
   useEffect(() => {
     look();
@@ -37,12 +42,14 @@ function Page() {
   }, [lost]);
   return html`
     ${lost && html`<div class="lost" role="alert">The service does not answer. The page tries again by itself; nothing that the service has begun is lost.</div>`}
-    ${["none", "over"].includes(session) ? html`<${LogIn} over=${session === "over"} entered=${setSession} />` : session ? html`<${Rooms} session=${session} left=${() => setSession("none")} />` : html`<p class="wait">Asking the service …</p>`}`;
+    ${(session === "none" || session?.over) && html`<${LogIn} over=${session.over} done=${enter} />`}
+    ${session?.scopes && html`<div hidden=${session.over}><${Rooms} session=${session} left=${() => setSession("none")} /></div>`}
+    ${session === null && html`<p class="wait">Asking the service …</p>`}`;
 }
 
-function LogIn({over, entered}) {
+function LogIn({over, done}) {
   const [key, setKey] = useState("");
-  const [enter, busy, problem] = useAction(async () => entered(await ask("POST", "/session", {headers: {Authorization: `Bearer ${key.trim()}`}})));
+  const [enter, busy, problem] = useAction(async () => done(await ask("POST", "/session", {headers: {Authorization: `Bearer ${key.trim()}`}})));
   const submit = (event) => {
     event.preventDefault();
     enter();
@@ -91,12 +98,12 @@ function Rooms({session, left}) {
 }
 
 function RigState({rig}) {
-  if (!rig) return html`<${Badge} kind="busy">asking<//>`;
-  if (rig.error) return html`<${Badge} kind="bad">not ready<//>`;
-  if (!rig.open) return html`<${Badge} kind="busy">opening<//>`;
-  if (rig.holder) return html`<${Badge} kind="busy">busy<//>`;
-  if (rig.calibrated === false) return html`<${Badge} kind="warn">not calibrated<//>`;
-  return html`<${Badge} kind="good">ready<//>`;
+  if (!rig) return html`<${Badge} kind="busy">Asking<//>`;
+  if (rig.error) return html`<${Badge} kind="bad">Not ready<//>`;
+  if (!rig.open) return html`<${Badge} kind="busy">Opening<//>`;
+  if (rig.holder) return html`<${Badge} kind="busy">Busy<//>`;
+  if (rig.calibrated === false) return html`<${Badge} kind="warn">Not calibrated<//>`;
+  return html`<${Badge} kind="good">Ready<//>`;
 }
 
 render(html`<${Page} />`, document.getElementById("app"));

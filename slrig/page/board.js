@@ -35,6 +35,6 @@ export function BoardFields({board, changed}) {
 /** Where the board is to be: as it stands, or a position of the rig's positioner. `value` null: as it stands. */
 export const PositionField = ({rig, value, chosen}) => rig?.positions.length > 0 && html`<label>Position of the board
   <select value=${value ?? ""} onChange=${(event) => chosen(event.target.value === "" ? null : Number(event.target.value))}>
-    <option value="">where it is now</option>
+    <option value="">Where it is now</option>
     ${rig.positions.map((name, index) => html`<option value=${index}>${name}</option>`)}
   </select></label>`;

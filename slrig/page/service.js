@@ -13,6 +13,8 @@ export class Problem extends Error {
 
 const UNREACHABLE = {title: "No answer", detail: "The service does not answer. Is it running, and the network up? The page tries again by itself."};
 const watchers = new Set();
+const readers = new Set();
+let over = false;
 
 /** Have `told` called with every problem that concerns the page as a whole: a session that is over, a lost service. */
 export function watchProblems(told) {
@@ -20,7 +22,14 @@ export function watchProblems(told) {
   return () => watchers.delete(told);
 }
 
+/** Somebody was let in: ask again for all that is shown. */
+export function entered() {
+  over = false;
+  for (const again of readers) again();
+}
+
 function tell(problem) {
+  over ||= problem?.status === 401;
   for (const told of watchers) told(problem);
 }
 
@@ -86,14 +95,16 @@ export function useValue(path, every_s = 0) {
   }, [path]);
   useEffect(() => {
     let timer = 0;
-    let over = false;
+    let ended = false;
     const turn = async () => {
-      if (!document.hidden) await again();
-      if (every_s && !over) timer = setTimeout(turn, every_s * 1000);
+      if (!document.hidden && !over) await again();
+      if (every_s && !ended) timer = setTimeout(turn, every_s * 1000);
     };
     turn();
+    readers.add(again);
     return () => {
-      over = true;
+      ended = true;
+      readers.delete(again);
       clearTimeout(timer);
     };
   }, [again, every_s]);

@@ -30,6 +30,9 @@ export function percent(share) {
   return Number.isFinite(share) ? `${number(100 * share)}\u00a0%` : "not known";
 }
 
+/** Words as the beginning of a sentence. */
+export const begun = (words) => words.slice(0, 1).toUpperCase() + words.slice(1);
+
 /** A moment as people say it. */
 export function moment(text) {
   if (!text) return "never";
@@ -79,7 +82,7 @@ export function Facts({of}) {
 export const Badge = ({kind, children}) => html`<span class=${`badge ${kind}`}>${children}</span>`;
 
 const KINDS = {succeeded: "good", failed: "bad", interrupted: "bad", cancelled: "warn", queued: "busy", capturing: "busy", computing: "busy"};
-export const JobBadge = ({state}) => html`<${Badge} kind=${KINDS[state] ?? ""}>${state}<//>`;
+export const JobBadge = ({state}) => html`<${Badge} kind=${KINDS[state] ?? ""}>${begun(state)}<//>`;
 
 /** Choose one of a few: `options` is a list of [value, words]. */
 export function Choice({label, value, options, chosen}) {

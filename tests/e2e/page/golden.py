@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Locator, Page
+    from playwright.sync_api import Page
 
 Picture = NDArray[np.uint8]
 
@@ -45,17 +45,12 @@ _PACKED = (cv2.IMWRITE_PNG_COMPRESSION, 9, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_P
            cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_FILTERED)  # fmt: skip
 
 
-def looks_as_kept(page: Page, name: str, *, part: Locator | None = None) -> None:
-    """Hold the upper part of a page, or some part of it, against the picture of that name; or keep it as that where
-    SLRIG_GOLDEN is set.
-    """
+def looks_as_kept(page: Page, name: str) -> None:
+    """Hold the upper part of a page against the picture of that name; or keep it as that where SLRIG_GOLDEN is set."""
     page.mouse.move(0, 0)
     page.locator("img:not([src*='/preview/'])").evaluate_all(_LOADED)
     factor, height = (4, 250) if page.evaluate("innerWidth") > _PHONE_PX else (3, 466)
-    if part is None:
-        shown = small(page.screenshot(full_page=True, animations="disabled"), factor)[:height]
-    else:
-        shown = small(part.screenshot(animations="disabled"), factor)
+    shown = small(page.screenshot(full_page=True, animations="disabled"), factor)[:height]
     if os.environ.get("SLRIG_GOLDEN"):
         levels = np.rint(shown / _STEP) * _STEP
         cv2.imwrite(str(_FOLDER / f"{name}.png"), levels.astype(np.uint8), _PACKED)

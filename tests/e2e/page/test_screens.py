@@ -29,6 +29,7 @@ from tests.e2e.page.golden import looks_as_kept
 from tests.e2e.test_calibration_walk import write_rig as write_board_rig
 from tests.e2e.test_model_walk import ANGLES, TURNTABLE, on_a_turntable
 from tests.unit.catalogue.test_store import job, row
+from tests.unit.schedule.receivers import Hook
 
 if TYPE_CHECKING:
     from playwright.sync_api import Locator, Page
@@ -133,41 +134,63 @@ def test_a_person_verifies_and_has_it_done_each_night(start: Start, tmp_path: Pa
     state.get_by_role("status").get_by_text("Good").wait_for()
     state.get_by_text("just now").wait_for()
     count(page.get_by_role("table", name="Last verifications").get_by_role("row"), 2)
-    picture = page.get_by_role("img", name="Change since calibration")
-    assert picture.evaluate("(image) => image.decode().then(() => image.naturalWidth)") > 0
+    picture = page.get_by_role("img", name="Largest mean disagreement of two devices, px: 1 verifications")
+    assert picture.locator("circle.good").count() == 1
+    page.get_by_role("region", name="Alerts").get_by_text("Damaged jobs").wait_for()
     assert violations(page) == []
     looks_as_kept(page, "health")
 
     form = page.get_by_role("form", name="Add to the schedule")
-    form.get_by_label("Minute, hour").fill("0 26 * * *")
+    form.get_by_text("More", exact=True).click()
+    form.get_by_label("Cron").fill("0 26 * * *")
     form.get_by_label("Name").fill("nights")
     describe_board(form)
     form.get_by_role("button", name="Add").click()
     form.get_by_role("alert").get_by_text("cron: Bad hour").wait_for()
-    form.get_by_label("Minute, hour").fill("30 2 * * *")
+    form.get_by_label("Cron").fill("")
+    form.get_by_label("Time", exact=True).fill("02:30")
     form.get_by_label("Time zone").fill("Europe/Berlin")
     form.get_by_role("button", name="Add").click()
     added = form.get_by_text("Added. Next:").inner_text()
     assert added.count("02:30") == 5
     nights = page.get_by_role("region", name="nights", exact=True)
-    nights.get_by_text("Verification, next").wait_for()
+    nights.get_by_text("Verification. Every day at 02:30, Europe/Berlin. Next:").wait_for()
     nights.get_by_role("button", name="Pause").click()
-    nights.get_by_text("paused: nothing becomes due").wait_for()
+    nights.get_by_text("Paused: nothing becomes due").wait_for()
     nights.get_by_role("button", name="Run now").click()
-    nights.get_by_text("under way").first.wait_for()
+    nights.get_by_text("Under way").first.wait_for()
     disabled(nights.get_by_role("button", name="Run now"))
     nights.get_by_text("The calibration is good").wait_for()
-    nights.get_by_text("asked for by a person, not by the clock").wait_for()
+    nights.get_by_text("Asked for by a person, not by the clock").wait_for()
+    nights.get_by_role("button", name=": Good").wait_for()
+    nights.get_by_role("link", name="Show the verification").click()
+    verify.get_by_role("heading", name="A verification on record").wait_for()
+    verify.get_by_role("link", name="Close").click()
+
+    # An alert: set, tried, and removed.
+    receiver = Hook()
+    alerts = page.get_by_role("region", name="Alerts")
+    alerts.get_by_label("Address of a webhook").fill(receiver.url)
+    alerts.get_by_role("button", name="Save and send a test notice").click()
+    alerts.get_by_text("Delivered", exact=True).wait_for()
+    alerts.get_by_text("status 204").wait_for()
+    assert receiver.next()["kind"] == "test"
+    receiver.status = 500
+    alerts.get_by_role("button", name="Send a test notice").click()
+    alerts.get_by_text("Not delivered", exact=True).wait_for()
+    alerts.get_by_text("status 500").wait_for()
     assert violations(page) == []
-    looks_as_kept(page, "schedule", part=nights)
     nights.get_by_role("button", name="Remove").click()
     page.get_by_role("alertdialog").get_by_role("button", name="Remove it").click()
-    page.get_by_text("Nothing is done by the clock yet.").wait_for()
+    page.get_by_text("No scheduled tasks.").wait_for()
+    alerts.get_by_role("button", name="Remove").click()
+    alerts.get_by_label("Address of a webhook").wait_for()
+    receiver.close()
 
     describe_board(verify, pose="pose 5")
     verify.get_by_role("button", name="Verify now").click()
-    verify.get_by_text("Likely cause: the projector turned by 0.06").wait_for()
-    verify.get_by_text("What to do: check the projector's mount, and calibrate again.").wait_for()
+    verify.get_by_text("Likely cause: The projector turned by 0.06").wait_for()
+    verify.get_by_text("What to do: Check the projector's mount, and calibrate again.").wait_for()
     page.get_by_role("table", name="Last verifications").get_by_role("cell", name="Watch").wait_for()
     assert violations(page) == []
 
@@ -248,18 +271,19 @@ def test_a_person_sees_many_rigs_at_once(start: Start, tmp_path: Path, visit: Vi
     address = f"sqlite:///{tmp_path}/fleet.sqlite"
     catalogue = open_catalogue(address, None, None)
     catalogue.open()
-    others(catalogue)
     service = start(write_rig(tmp_path / "rig"), SLRIG_CATALOGUE=address)
     with service.client() as client:
         client.scan()
+    # Last: a slow machine would take them for away.
+    others(catalogue)
     page = visit(service)
     page.get_by_role("link", name="Fleet").click()
     page.get_by_text("4 rigs, 1 not ready, 1 not seen for a minute or longer").wait_for()
     rigs = page.get_by_role("region", name="Rigs").get_by_role("row")
     count(rigs, 5)
-    for number, words in enumerate(["busy", "does not answer", "not seen", "this one"]):
+    for number, words in enumerate(["Busy", "does not answer", "Not seen", "This one"]):
         rigs.nth(1 + number).get_by_text(words, exact=number == 2).first.wait_for()
-    assert rigs.nth(3).get_by_text("not known").count() == 2
+    assert rigs.nth(3).get_by_text("Not known").count() == 2
     assert violations(page) == []
     looks_as_kept(page, "fleet")
     phone = visit(service, "fleet", size=PHONE, dark=True)
@@ -269,6 +293,9 @@ def test_a_person_sees_many_rigs_at_once(start: Start, tmp_path: Path, visit: Vi
     catalogue.close()
 
 
+WRITTEN_IN = ("models", "calibrate", "health")
+"""Screens with something to fill in."""
+OVER = {"type": "/problems/unauthorized", "title": "Log in first", "status": 401, "detail": "The session is over."}
 COMPLAINT = "Failed to load resource"
 """What Chromium itself says of a request that is refused, or not answered."""
 
@@ -300,6 +327,24 @@ def test_a_camera_is_unplugged_and_a_key_expires(start: Start, tmp_path: Path, v
     page.get_by_role("button", name="Enter").click()
     page.get_by_text("Logged in as environment").wait_for()
     assert page.url.endswith("#/devices")
+
+    # On every screen the page says so, and keeps what is shown and was typed.
+    field = page.locator("#content input:is([type=number], [type=text]):visible").first
+    for screen in WRITTEN_IN:
+        page.goto(f"{service.url}/#/{screen}")
+        field.fill("7")
+        page.route("**/*", lambda route: route.abort())
+        page.get_by_role("alert").get_by_text("The service does not answer.").wait_for()
+        assert field.input_value() == "7", screen
+        page.unroute_all(behavior="ignoreErrors")
+        page.get_by_role("alert").get_by_text("The service does not answer.").wait_for(state="detached")
+        page.route("**/rig", lambda route: route.fulfill(status=401, json=OVER))
+        page.get_by_role("alert").get_by_text("Your session is over").wait_for()
+        page.unroute_all(behavior="ignoreErrors")
+        page.get_by_label("Key").fill(KEY)
+        page.keyboard.press("Enter")
+        field.wait_for()
+        assert field.input_value() == "7", screen
 
 
 def test_health_without_a_calibration_while_the_service_goes_and_comes_back(

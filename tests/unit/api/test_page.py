@@ -104,13 +104,17 @@ WRITTEN = {
     "duration(259200)": "3 days",
     "bytes(5.25e9)": "5.3 GB", "count(1234567)": "1 234 567", "percent(0)": "0 %", "percent(3.7e-5)": "< 0.01 %",
     "percent(0.9998)": "> 99.9 %", "percent(0.12345)": "12.3 %", "number(-1e-5, {decimals: 2})": "0.00",
+    "weeks('2027-02')[0][0]": "2027-02-01", "weeks('2026-11').length": 6, "weeks('2026-11')[0].at(-1)": "2026-11-01",
+    "cronOf({days: 'mon-fri', time: '06:30'})": "30 6 * * mon-fri", "when('30 6 * * mon-fri')": "Working days at 06:30",
+    "cronOf({days: '1', time: '04:05'})": "5 4 1 * *", "when('*/5 * * * *')": "At */5 * * * *",
 }  # fmt: skip
 
 
-def test_numbers_are_written_for_people() -> None:
+def test_numbers_and_times_are_written_for_people() -> None:
     node = shutil.which("node") or lacking("needs Node 18 or newer, to run the page's modules: apt install nodejs")
-    calls = ", ".join(f"ui.{each}" for each in WRITTEN)
-    program = f"import * as ui from '{(FOLDER / 'ui.js').as_uri()}'; console.log(JSON.stringify([{calls}]))"
+    modules = ", ".join(f"...await import('{(FOLDER / name).as_uri()}')" for name in ("ui.js", "schedule.js"))
+    calls = ", ".join(f"page.{each}" for each in WRITTEN)
+    program = f"const page = {{{modules}}}; console.log(JSON.stringify([{calls}]))"
     done = subprocess.run(  # noqa: S603 - our own program
         [node, "--input-type=module", "--eval", program], capture_output=True, text=True, check=True
     )
