@@ -161,7 +161,7 @@ _CAUSES: Mapping[Refusal, tuple[tuple[int, int, int], str]] = {
     Refusal.STRAY_CODE: ((0, 94, 213), "the code differs from that of the rest of its stripe"),
     Refusal.SHORT_STRIPE: ((167, 121, 204), "the stripe is too short to be trusted"),
     Refusal.SHADOW_EDGE: ((115, 158, 0), "at the edge of a shadow, which displaces the stripe"),
-    Refusal.DEPTH_EDGE: ((255, 0, 170), "two surfaces in one pixel: a step in depth is near"),
+    Refusal.DEPTH_EDGE: ((255, 0, 170), "depth edge: two surfaces in one pixel"),
     Refusal.OFF_PROJECTOR: ((60, 90, 140), "its ray meets the light where the projector has no pixel"),
     Refusal.BEHIND_DEVICE: ((150, 150, 0), "its ray meets the light behind the camera or the projector"),
     Refusal.NO_INTERSECTION: ((120, 40, 120), "its ray does not meet the light"),
