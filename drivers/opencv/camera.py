@@ -344,7 +344,7 @@ class OpenCvCamera:
             arrivals = None if source.options.delay_s is None else self._arrivals()
             feed = DeviceFeed(capture, source.label, period_ns, arrivals)
             self._exposure_s = self._exposure_s or period_ns / 1e9
-            skipped, self._notes = switch_off_automatics(source.label, source.options.skip_controls)
+            skipped, self._notes = switch_off_automatics(source.label, source.options)
             fixed_s = self._exposure_s
             controls = CaptureControls(capture, source.options, source.label, fixed_s=fixed_s, skipped=skipped)
             decoder = raw_decoder(code, read_size(capture), source.options.bit_depth)

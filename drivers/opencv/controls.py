@@ -9,7 +9,6 @@ does not have reads as -1. On other systems the numbers have other meanings, whi
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from ctypes import Structure
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,14 @@ import cv2
 from drivers.opencv.options import OpenCvOptions
 from drivers.v4l2 import controls as v4l2
 from drivers.v4l2 import kernel
-from drivers.v4l2.controls import AUTOGAIN, exclude_controls, list_controls, set_control, switch_off_processing
+from drivers.v4l2.controls import (
+    AUTOGAIN,
+    exclude_controls,
+    list_controls,
+    require_focus,
+    set_control,
+    switch_off_processing,
+)
 from drivers.v4l2.finding import query_identity
 from slrig.devices import AppliedSettings, CameraSettings
 from slrig.errors import DeviceGoneError, SlrigError, UnsupportedByDeviceError
@@ -61,24 +67,27 @@ def require_present(path: str, otherwise: DeviceGoneError) -> None:
         raise otherwise from error
 
 
-def switch_off_automatics(path: str, skipped: Sequence[str]) -> tuple[frozenset[int], tuple[str, ...]]:
+def switch_off_automatics(path: str, options: OpenCvOptions) -> tuple[frozenset[int], tuple[str, ...]]:
     """Switch a camera's automatic gain and image processing off, for which OpenCV has no properties.
 
-    Return the numbers of the controls named in `skipped`, which are left alone, and notes for the user.
+    Return the numbers of the controls that the options leave alone, and notes for the user.
 
     Raises
     ------
     DeviceGoneError, DeviceError
         The camera is not connected, or fails.
     UnsupportedByDeviceError
-        It has no control of such a name, or its automatic gain cannot be switched off.
+        It has no control of such a name, its automatic gain cannot be switched off, or a motor moves its lens and the
+        options name no focus.
     """
     node = Path(path)
     try:
         handle = kernel.open_node(node)
         try:
             every = list_controls(handle)
-            used = exclude_controls(every, skipped, node)
+            used = exclude_controls(every, options.skip_controls, node)
+            if options.focus is None:
+                require_focus(handle, node, used, named=())
             if AUTOGAIN in used:
                 set_control(handle, node, used[AUTOGAIN], 0)
             notes = switch_off_processing(handle, node, used, named=(), is_uvc=query_identity(handle).is_uvc)

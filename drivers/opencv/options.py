@@ -67,7 +67,7 @@ class OpenCvOptions(Strict, use_attribute_docstrings=True):
     """Frames of a camera discarded after it starts, until its settings have taken effect."""
 
     focus: float | None = None
-    """Value of a camera's focus control; autofocus is off in any case."""
+    """Value of a camera's focus control, wanted of a lens with a motor; autofocus is off in any case."""
 
     skip_controls: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """Controls of a camera to leave as they are, by their names in `v4l2-ctl --list-ctrls`."""

@@ -119,7 +119,8 @@ class V4L2Camera:
             except OSError as error:
                 raise kernel.device_error(node.path, "listing its controls", error) from error
             self._scale = GainScale(gain_control(self._controls), options.gain_unity)
-            require_focus(self._handle, node.path, self._controls, options)
+            if options.focus is None:
+                require_focus(self._handle, node.path, self._controls, options.controls)
             processed = switch_off_processing(
                 self._handle, node.path, self._controls, named=options.controls, is_uvc=identity.is_uvc
             )

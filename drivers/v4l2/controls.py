@@ -317,13 +317,14 @@ def ordered_settings(
     return tuple(steps)
 
 
-def require_focus(handle: int, node: Path, controls: Controls, options: V4L2Options) -> None:
+def require_focus(handle: int, node: Path, controls: Controls, named: Collection[str]) -> None:
     """Raise UnsupportedByDeviceError where the lens can be moved, and the user does not say where it is to stand.
 
-    Another program, a new plug or the camera itself moves it, and a calibration holds for one place.
+    Another program, a new plug or the camera itself moves it, and a calibration holds for one place. named : controls
+    that the user sets.
     """
     lens = controls.get(FOCUS_ABSOLUTE)
-    if lens is None or options.focus is not None or lens.name in options.controls:
+    if lens is None or lens.name in named:
         return
     message = (
         f"{node}: a motor moves its lens, and a calibration holds for one place of it. Make the picture sharp, and "

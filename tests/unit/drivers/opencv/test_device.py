@@ -124,7 +124,7 @@ def plugged(monkeypatch: pytest.MonkeyPatch) -> Iterator[Plug]:
 
 
 def opened(**options: object) -> OpenCvCamera:
-    camera = open_camera("left", {"device": str(NODE), **options}, NODE.parent)
+    camera = open_camera("left", {"device": str(NODE), "focus": 0, **options}, NODE.parent)
     assert isinstance(camera, OpenCvCamera)
     return camera
 
@@ -206,6 +206,13 @@ def test_image_processing_is_off_and_a_control_that_fails_is_noted(plugged: Plug
     camera.close()
     with pytest.raises(UnsupportedByDeviceError, match="control 'gian', the device has: auto_exposure"):
         opened(skip_controls=["gian"])
+
+
+def test_a_lens_with_a_motor_needs_its_place(plugged: Plug) -> None:
+    plugged()
+    with pytest.raises(UnsupportedByDeviceError, match=r"a motor moves its lens.*focus = 0 is where it stands now"):
+        opened(focus=None)
+    opened(focus=None, skip_controls=["focus_absolute"]).close()
 
 
 def options(**given: Any) -> OpenCvOptions:
