@@ -26,6 +26,9 @@ export const loadDrawing = () => {
   return drawing;
 };
 
+// A page that is opened at a result loads it together with the session and the scan.
+if (/^#\/(scan|models)\/./.test(location.hash)) loadDrawing().catch(() => {});
+
 /**
  * `scan`: a scan, or a model of several, which is `merged` and has no stripes. `other`: a scan shown in the same view, or null. `report` and `calibration` may come later.
  * `again` takes the box of what is seen, or is null. `over` stands over the middle of the stage. `pointed`: {mm}, a point that is pointed at, or {fromMm, along}, the ray
@@ -66,7 +69,9 @@ export function Mesh({scan, other = null, report, calibration = null, again, ove
   useEffect(() => {
     if (told.values && view) view.tell(meshes.full, told.values);
   }, [view, told.values]);
-  useEffect(() => view?.set(mode, form, range, told.kinds.map(({colour}) => colour), shown), [view, mode, form, ...range, told.kinds, ...shown]);
+  // Until its values are computed, a mode shows the shape.
+  const drawn = alone && !told.values ? "shaded" : mode;
+  useEffect(() => view?.set(drawn, form, range, told.kinds.map(({colour}) => colour), shown), [view, drawn, form, ...range, told.kinds, ...shown]);
   useEffect(() => view?.limit(scan.plan?.reconstruction?.region?.box_mm), [view, scan.id]);
   const measuring = useMeasuring(view);
   const ready = view !== null && meshes.full !== undefined;

@@ -19,7 +19,8 @@ export function Workspace({label, stage, top, bottom, keys = [], children}) {
   };
   const fill = () => document.fullscreenElement ? document.exitFullscreen() : whole.current.requestFullscreen();
   const tell = () => help.current.open ? help.current.close() : help.current.showModal();
-  const all = [...keys, ...children ? [["t", "Fold or unfold the panels", fold]] : [], ["x", "Full screen, and back", fill], ["?", "Show these keys", tell]];
+  const all = [...keys, ...children ? [["t", "Fold or unfold the panels", fold]] : [],
+    ...document.fullscreenEnabled ? [["x", "Full screen, and back", fill]] : [], ["?", "Show these keys", tell]];
   const pressed = useRef();
   pressed.current = (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input, select, textarea")) return;
@@ -42,7 +43,7 @@ export function Workspace({label, stage, top, bottom, keys = [], children}) {
         <div class="bar">${top}</div>
         <div class="bar ends">
           ${children && html`<${Action} aria-expanded=${!folded} onClick=${fold}>Panels<//>`}
-          <${Action} onClick=${fill}>Full screen<//><${Action} aria-label="Keys" onClick=${tell}>?<//>
+          ${document.fullscreenEnabled && html`<${Action} onClick=${fill}>Full screen<//>`}<${Action} aria-label="Keys" onClick=${tell}>?<//>
         </div>
       </div>
       <div class="over bottom">${bottom}</div>
