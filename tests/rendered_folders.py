@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import random
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -23,7 +23,7 @@ from simulated_rig.scene import build_surface, read_scene
 from slrig.errors import SlrigError
 from slrig.importers import ImageNaming, ProjectorCode, assign_images
 from slrig.importers.captures import ImageAssignment
-from slrig.model import Axis, Black, Gray, LineShift, Pattern, Pixels, Sine, Size, White
+from slrig.model import Axis, Black, Gray, LineShift, Pattern, Pixels, Size, White
 from tests.light_bound import ExposedView
 
 CONFIG = Path(__file__).parents[1] / "config"
@@ -113,9 +113,6 @@ def pattern_light(pattern: Pattern, size: Size) -> Pixels:
             line = gray_light(size.along(axis), bit, bits, cell, offset, inverted=inverted)
         case LineShift(axis, shift, period, width):
             line = (((np.arange(size.along(axis)) - shift) % period < width) * 255).astype(np.uint8)
-        case Sine(axis, sine_period, phase, steps):
-            turns = np.arange(size.along(axis)) / sine_period - phase / steps
-            line = np.rint(127.5 + 127.5 * np.cos(2 * np.pi * turns)).astype(np.uint8)
         case _:
             raise AssertionError(pattern)
     return line[None, :] if axis is Axis.COLUMN else line[:, None]
@@ -182,10 +179,10 @@ def sequence(chance: random.Random, size: Size, kinds: list[str]) -> list[Patter
     return [*leading.get(ends, []), *body, *closing.get(ends, [])]
 
 
-def make_folder(seed: int, path: Path, *, scene_number: int | None = None) -> Folder:
+def make_folder(seed: int, path: Path) -> Folder:
     """Write a folder of images by chance."""
     chance = random.Random(seed)
-    number = chance.randrange(len(SCENES)) if scene_number is None else scene_number
+    number = chance.randrange(len(SCENES))
     stage = scene(number)
     folder = Folder(path, stage.size)
     shown: list[Pattern | None] = list(sequence(chance, stage.size, folder.kinds))
@@ -218,74 +215,6 @@ def make_folder(seed: int, path: Path, *, scene_number: int | None = None) -> Fo
         lone = cv2.normalize(room, None, 0, 250, cv2.NORM_MINMAX).astype(kind)
         cv2.imwrite(str(file), lone if chance.random() < 0.5 else lone[:-7])
         folder.shown[str(file.relative_to(path))] = None
-    return folder
-
-
-def sinusoid_sequence(chance: random.Random, size: Size, kinds: list[str]) -> list[Pattern]:
-    """A random program's sinusoids of several periods, which number positions without a Gray code."""
-    style = chance.choice(
-        ["spanning", "spanning", "spanning", "beats", "beats", "near", "near", "2x3", "micro", "whole"]
-    )
-    axes = chance.choice([[Axis.COLUMN], [Axis.COLUMN], [Axis.COLUMN, Axis.ROW], [Axis.ROW, Axis.COLUMN]])
-    steps = chance.choice([3, 3, 4, 4, 4, 5, 6, 8])
-    direction, start = chance.choice([1, 1, -1]), chance.choice([0, 0, 0, 1])
-    order = chance.choice(["periods", "periods", "periods", "steps"])
-    ends = chance.choice(["WB first", "BW first", "WB last", "none", "none", "both"])
-    if style in ("2x3", "micro"):
-        axes, steps, direction, start, order, ends = [Axis.COLUMN], 3, 1, 0, "periods", "none"
-    kinds += [style, "+".join(axes), f"{steps} steps", "forward" if direction > 0 else "backward",
-              "sine" if start else "cosine", f"by {order}", ends]  # fmt: skip
-    wide = min(map(size.along, axes)) > 560
-    choices: dict[str, list[tuple[int, ...]]] = {
-        "spanning": [(1, 8, 64), (1, 6, 36), (1, 4, 16, 64), (1, 16), (1, 12, 48), (1, 5, 25)],
-        "beats": [(28, 26, 23), (31, 28, 26), (36, 35, 30), *([(70, 64, 59)] if wide else [])],
-        "2x3": [(1, 16)],
-    }
-    counts = chance.choice(choices.get(style, [()]))
-    if chance.random() < 0.5 or style == "2x3":
-        counts = counts[::-1]
-    near_px, whole_px = chance.choice([8.0, 10.0, 12.0, 16.0]), chance.choice([(16, 128, 1024), (14, 13, 12)])
-    kinds.append(str({"near": near_px, "whole": whole_px}.get(style, counts)))
-    body: list[Pattern] = []
-    for axis in axes:
-        extent = size.along(axis)
-        number = max(3, -(-extent // int(near_px)) + 1)
-        periods: dict[str, list[float]] = {
-            "near": [near_px, number * near_px / (number - 1), number * near_px / (number - round(number**0.5))],
-            "whole": [float(each) for each in whole_px],
-        }
-        if style == "micro":
-            others = (70.0, 71.32, 72.47, 73.72, 76.23, 77.35, 78.4, 79.22, 80.0)
-            body += [Sine(axis, 75.02, k, 3) for k in (0, 2, 1)]
-            body += [Sine(axis, period, 1 - k % 2, 2) for k, period in enumerate(others)]
-            continue
-        own = periods.get(style, [extent / each for each in counts if extent / each >= 6])
-        # A sine begins a quarter of a period before a cosine.
-        finer = 1 if not start or steps % 4 == 0 else 2 if steps % 2 == 0 else 4
-        first = finer * steps // 4 * start
-        shifted = [[Sine(axis, period, (first + direction * finer * k) % (finer * steps), finer * steps)
-                    for k in range(steps)] for period in own]  # fmt: skip
-        body += [each for group in (shifted if order == "periods" else zip(*shifted, strict=True)) for each in group]
-    white, black = White(), Black()
-    leading: dict[str, list[Pattern]] = {"WB first": [white, black], "BW first": [black, white], "both": [white, black]}
-    closing: dict[str, list[Pattern]] = {"WB last": [white, black], "both": [white, black]}
-    return [*leading.get(ends, []), *body, *closing.get(ends, [])]
-
-
-def make_sinusoid_folder(seed: int, path: Path) -> Folder:
-    """Write a folder of images of sinusoids of several periods by chance."""
-    chance = random.Random(f"sinusoids {seed}")
-    number = chance.randrange(len(SCENES))
-    stage = scene(number)
-    folder = Folder(path, stage.size)
-    shown: list[Pattern | None] = list(sinusoid_sequence(chance, stage.size, folder.kinds))
-    fault = chance.choice(["right"] * 8 + ["twice"])
-    folder.kinds += [f"scene {number}", fault]
-    profiles = [pattern_light(each, stage.size) for each in shown if each is not None]
-    images = _photographed(chance, stage, profiles, folder.kinds)
-    if fault == "twice":
-        _double_one(chance, folder, shown, images)
-    _write(chance, folder, shown, images)
     return folder
 
 
@@ -395,11 +324,9 @@ def judge(folder: Folder, understood: ImageAssignment | SlrigError) -> str:
     return "wrong" if understood.understood is not None and understood.understood.doubts else "wrong in silence"
 
 
-def understand_folder_of(
-    seed: int, path: Path, make: Callable[[int, Path], Folder] = make_folder
-) -> tuple[Folder, str]:
+def understand_folder_of(seed: int, path: Path) -> tuple[Folder, str]:
     """Write a folder by chance and judge what the importer makes of it without an option."""
-    folder = make(seed, path)
+    folder = make_folder(seed, path)
     try:
         understood: ImageAssignment | SlrigError = assign_images(path, ProjectorCode(folder.projector), ImageNaming())
     except SlrigError as cause:

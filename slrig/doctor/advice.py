@@ -13,7 +13,7 @@ _PERIOD_TOLERANCE = 0.02
 _NEGLIGIBLE_FLICKER = 0.004
 _MAX_PERIODS = 64
 _PERIODS_PX = (8, 12, 16, 24, 32)
-"""From the default on: shorter periods gain nothing, however sharp the picture (`tests/bench/line_sweep.py`)."""
+"""From the default on: shorter periods gain nothing, however sharp the picture (`slrig/scan/README.md`)."""
 _MIN_GAIN = 1.1
 
 

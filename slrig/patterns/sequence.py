@@ -63,9 +63,7 @@ SEQUENCES: Mapping[SequenceName, SequenceOptions] = {
         period_px=8, steps=4, line_width_px=None, inverses=False, closing=0, sines=True
     ),
 }
-"""Chosen by `tests/bench/line_sweep.py` and tested by `tests/bench/fault_campaign.py`;
-`slrig/scan/README.md` lists costs and results.
-"""
+"""`slrig/scan/README.md` lists what they were chosen by, with costs and results."""
 
 
 def scan_patterns(

@@ -2,8 +2,6 @@
 
 Cameras that interpolate, bend or compress their frames; a bright room, exposure that creeps, lamps on mains before a
 rolling shutter, lenses that are sharp at one distance.
-
-`tests/bench/test_image_processing.py` has the whole table.
 """
 
 from __future__ import annotations

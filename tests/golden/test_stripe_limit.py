@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slrig.model import FloatArray
-from tests.bench.stripe_limit import PLANE, SHARP_PX, SOFT_PX, SPHERE, Points, exposed_at_snr, measured, rig
+from tests.golden.stripe_limit import PLANE, SHARP_PX, SOFT_PX, SPHERE, Points, exposed_at_snr, measured, rig
 from tests.unit.reconstruction.builders import rms
 
 pytestmark = pytest.mark.slow

@@ -1,6 +1,6 @@
 """Objects from eight sides each, whose poses nobody knows: the answer of known starts, or none, in words.
 
-Three of ten, since each takes 15 to 20 s; `tests/bench/test_unknown_poses.py` has the others.
+Each object takes 15 to 20 s.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from slrig.errors import RegistrationRefusedError
 from slrig.model import FloatArray
 from slrig.multiview.registration import register_views
 from slrig.multiview.unknown_poses import find_start_poses
-from tests.ten_objects import OBJECTS, SYMMETRIC, seen_around, seen_from
+from tests.known_objects import OBJECTS, SYMMETRIC, seen_around, seen_from
 from tests.turned_views import displacement_mm
 from tests.unit.multiview.known_views import View, around
 

@@ -1,4 +1,4 @@
-"""Views without known poses: three at a time here, eight of ten objects in tests/golden/test_unknown_poses.py."""
+"""Views without known poses: three at a time here, eight in tests/golden/test_unknown_poses.py."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from slrig.errors import RegistrationRefusedError
 from slrig.multiview.matching import compare_views, prepare_with_depth, transform_points
 from slrig.multiview.unknown_poses import find_start_poses, rigid_motions
-from tests.ten_objects import OBJECTS, seen_from
+from tests.known_objects import OBJECTS, seen_from
 from tests.turned_views import displacement_mm
 from tests.unit.multiview.known_views import View
 
