@@ -110,9 +110,7 @@ def prepared_bundle(folders: pytest.TempPathFactory, name: str) -> Path:
             wanted = BUNDLES[name]
             shutil.rmtree(kept / "part", ignore_errors=True)
             with open_rig(read_rig(wanted.rig_file(kept))) as rig:
-                capture_frames(
-                    rig, wanted.plan, kept / "part", progress=lambda *_: None, cancelled=lambda: False
-                ).finish()
+                capture_frames(rig, wanted.plan, kept / "part").finish()
             if not wanted.truth:
                 for path in (*(kept / "part").glob("truth*"), kept / "part" / "visible_points.npy"):
                     path.unlink(missing_ok=True)

@@ -144,6 +144,6 @@ def rendered_poses(
             rig.positioner.move(index)
             bundle = folder / f"pose_{number:02d}"
             plan = ScanPlan(patterns=PatternPlan(rows=True))
-            capture_frames(rig, plan, bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
+            capture_frames(rig, plan, bundle).finish()
             bundles.append(bundle)
     return bundles

@@ -37,13 +37,13 @@ from slrig.errors import (
     DeviceBusyError,
     InvalidInputError,
     JobNotFoundError,
-    ScanCancelledError,
     ScanStateError,
     UnsupportedByDeviceError,
     setting,
 )
 from slrig.jobs.data_folder import BUNDLE, DataFolder, write_entries
 from slrig.jobs.job import Job, JobRun, Outcome
+from slrig.jobs.listener import Listener
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import Clock, Holder, JobKind, JobRecord, utc_now
 from slrig.jobs.worker import Task
@@ -51,7 +51,7 @@ from slrig.model import Calibration, FloatArray
 from slrig.rig.session import RigSession
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.artefacts import MESH, decode_mesh_ply
-from slrig.scan.plan import ProgressCallback, ReconstructionPlan, ScanPlan, check_plan
+from slrig.scan.plan import ReconstructionPlan, ScanPlan, check_plan
 
 
 def bundle_name(step: Step, take: int) -> str:
@@ -59,28 +59,18 @@ def bundle_name(step: Step, take: int) -> str:
     return f"{step.name}-{take + 1}"
 
 
-def capture_take(
-    rig: Rig, plan: AcceptancePlan, bundle: Path, *, progress: ProgressCallback, cancelled: Callable[[], bool]
-) -> None:
+def capture_take(rig: Rig, plan: AcceptancePlan, bundle: Path, listener: Listener) -> None:
     """Record a bundle of the artefact that stands before the rig. Raises CalibrationError, and as a scan."""
     calibration = required_calibration(rig)
     # The test must not use what a rendered rig knows of its scene; and the noise of a point, stated next to its form,
     # leaves out the calibration's own error, which the form shows.
     blind = replace(rig, head=None, calibration=replace(calibration, solved=None))
     scan = ScanPlan(exposure_s=plan.exposure_s)
-    capture_frames(blind, scan, bundle, progress=progress, cancelled=cancelled).finish()
+    capture_frames(blind, scan, bundle, listener).finish()
 
 
 def evaluated(
-    bundle: Path,
-    folder: Path,
-    plan: AcceptancePlan,
-    step: Step,
-    take: int,
-    /,
-    *,
-    progress: ProgressCallback,
-    cancelled: Callable[[], bool],
+    bundle: Path, folder: Path, plan: AcceptancePlan, step: Step, take: int, listener: Listener, /
 ) -> Reading:
     """Reconstruct a bundle, measure the artefact in its mesh, and keep its points in `folder`."""
     # The process that owns the rig loads the mathematics only if it has to do it itself.
@@ -88,7 +78,7 @@ def evaluated(
 
     with TemporaryDirectory(dir=bundle.parent, prefix=".mesh-") as scratch:
         made = Path(scratch) / "mesh"
-        reconstruct_bundle(bundle, made, plan=ReconstructionPlan(), progress=progress, cancelled=cancelled)
+        reconstruct_bundle(bundle, made, listener, plan=ReconstructionPlan())
         with storage_errors(made):
             mesh = decode_mesh_ply((made / MESH).read_bytes())
     found, evidence = reading(mesh, step, take, plan)
@@ -227,25 +217,17 @@ class PositionJob(Job):
         with storage_errors(run.recording):
             run.recording.mkdir()
         for step, take in takes:
-            if run.cancelled():
-                message = f"the acceptance test was cancelled before {step.name}; what was measured before is kept"
-                raise ScanCancelledError(message)
+            run.check(f"the acceptance test was cancelled before {step.name}; what was measured before is kept")
             # A repeat is captured without a move, so that it shows the scanner's scatter alone.
-            capture_take(
-                opened, plan, run.recording / bundle_name(step, take),
-                progress=self._progress(run, take, len(takes)), cancelled=run.cancelled,
-            )  # fmt: skip
+            capture_take(opened, plan, run.recording / bundle_name(step, take), run.part(take, len(takes), self.step))
 
     def compute(self, run: JobRun) -> Outcome:
         """Measure the artefact in each capture."""
         plan = read_test(_test_of(run)).plan
         takes, readings = takes_of(plan, self.step), list[Reading]()
         for step, take in takes:
-            found = evaluated(
-                run.bundle / bundle_name(step, take), run.folder, plan, step, take,
-                progress=self._progress(run, take, len(takes)), cancelled=run.cancelled,
-            )  # fmt: skip
-            readings.append(found)
+            part = run.part(take, len(takes), self.step)
+            readings.append(evaluated(run.bundle / bundle_name(step, take), run.folder, plan, step, take, part))
         # Where the points of a test lie, which is where this folder goes to.
         with storage_errors(run.folder):
             for file in (run.folder / "positions" / self.step).iterdir():
@@ -257,12 +239,6 @@ class PositionJob(Job):
     def place(self, data: DataFolder, job_id: UUID) -> Path:  # noqa: ARG002 - as it is called
         """See `Job`."""
         return data.root / "acceptance" / str(self.group) / "positions" / self.step
-
-    def _progress(self, run: JobRun, take: int, takes: int) -> ProgressCallback:
-        def progress(stage: str, fraction: float, detail: str, /) -> None:
-            run.report(f"{self.step}: {stage}", (take + min(max(fraction, 0.0), 1.0)) / takes, detail)
-
-        return progress
 
 
 def write_test_report(result: AcceptanceResult, folder: Path) -> None:

@@ -111,7 +111,7 @@ class PoseJob(Job):
             opened.positioner.move(self.position)
         # Neither an earlier calibration nor what a rendered rig knows of its scene is any business of this one's.
         bare = replace(opened, calibration=None, head=None)
-        return capture_frames(bare, self._scan, run.recording, progress=run.report, cancelled=run.cancelled)
+        return capture_frames(bare, self._scan, run.recording, run)
 
     def compute(self, run: JobRun) -> Outcome:
         """Read the pose, judge it by those before it, and draw what each camera saw."""
@@ -182,8 +182,7 @@ class SolveJob(Job):
         setting, poses = setting_of(record), session_readings(session)
         compared = session / COMPARED
         result = store.solve_poses(
-            setting.board, setting.cameras, setting.projector, poses,
-            progress=run.step,
+            setting.board, setting.cameras, setting.projector, poses, run,
             earlier=read_calibration(compared) if compared.is_file() else None,
             board_shape=self.board_shape,
             tolerance_mm=self.tolerance_mm,
@@ -305,12 +304,8 @@ class AxisJob(Job):
             name = f"{angle_deg:g}°"
             run.step(f"{name}: turn", number / self.count, "")
             table.turn(angle_deg)
-
-            def progress(stage: str, fraction: float, detail: str, /, name: str = name, done: int = number) -> None:
-                run.report(f"{name}: {stage}", (done + fraction) / self.count, detail)
-
             place = run.recording / f"{number:02d}"
-            capture_frames(bare, self._scan, place, progress=progress, cancelled=run.cancelled).finish()
+            capture_frames(bare, self._scan, place, run.part(number, self.count, name)).finish()
         table.turn(0.0)
 
     def compute(self, run: JobRun) -> Outcome:

@@ -64,11 +64,12 @@ from slrig.errors import (
 )
 from slrig.failure import JobFailure, disk_errors
 from slrig.jobs.data_folder import BUNDLE, DataFolder, require_whole, write_entries
+from slrig.jobs.listener import SILENT, Listener
 from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, read_record, utc_now
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration, SequenceName, Size, SolveRecord
 from slrig.rig.session import ActiveCalibration
-from slrig.scan.plan import PatternPlan, ProgressCallback
+from slrig.scan.plan import PatternPlan
 
 USUAL_PATTERNS = PatternPlan(sequence=SequenceName.ROBUST, rows=True)
 """White, Gray code and line shift along both axes: the projector has columns and rows to be calibrated."""
@@ -275,9 +276,9 @@ def solve_poses(
     cameras: Mapping[str, Size],
     projector: Size | None,
     poses: Sequence[ReadPose],
+    listener: Listener = SILENT,
     /,
     *,
-    progress: ProgressCallback = lambda _stage, _fraction, _detail: None,
     earlier: Calibration | None = None,
     board_shape: BoardShape = BoardShape.AUTO,
     tolerance_mm: float | None = None,
@@ -302,10 +303,10 @@ def solve_poses(
     observations = Observations(board, cameras, projector, observed)
     solution = solve(
         observations,
-        progress=lambda stage, fraction, detail: progress(stage, _SOLVE_SHARE * fraction, detail),
+        progress=lambda stage, fraction, detail: listener.step(stage, _SOLVE_SHARE * fraction, detail),
         board_shape=board_shape,
     )
-    progress("expected error", _SOLVE_SHARE, "")
+    listener.step("expected error", _SOLVE_SHARE, "")
     try:
         expected = expected_error(solution, observations)
     except CalibrationError as error:
@@ -322,7 +323,7 @@ def solve_poses(
         expected_error_mm=expected.point_mm,
         scale_sigma=solution.size.scale_sigma,
     )
-    progress("done", 1.0, "")
+    listener.step("done", 1.0, "")
     scale = None if earlier is None else check_scale(solution, earlier, board)
     return CalibrationResult(
         solution=solution,

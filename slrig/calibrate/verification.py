@@ -110,7 +110,7 @@ class VerificationJob(Job):
             opened.positioner.move(self.position)
         # A verification must not use what a rendered rig knows of its scene.
         bare = replace(opened, head=None)
-        return capture_frames(bare, self._scan, run.recording, progress=run.report, cancelled=run.cancelled)
+        return capture_frames(bare, self._scan, run.recording, run)
 
     def compute(self, run: JobRun) -> Outcome:
         """Read the board, and hold the calibration against it."""

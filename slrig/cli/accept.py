@@ -41,6 +41,7 @@ from slrig.discovery import open_rig
 from slrig.disk import storage_errors
 from slrig.errors import InvalidInputError, NothingToReconstructError, ScanCancelledError, ScanEvidenceError, SlrigError
 from slrig.failure import error_of
+from slrig.jobs.listener import SILENT, Listener
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import Holder
 from slrig.logs import set_up_console_logs
@@ -122,14 +123,13 @@ def accept(rig_file: Path, asked: AcceptanceOptions, *, output: Path, scripted: 
             plan = manager.lend(_HOLDER, lambda rig, _: plan_for(asked, rig.open()))
             if scripted:
                 with progress_shown() as display:
-                    result = measure_positions(manager, plan, output, progress=display)
+                    result = measure_positions(manager, plan, output, Listener(report=display))
             else:
                 count = f"{len(plan.steps)} positions, {len(plan.takes)} captures"
                 console.print(f"An acceptance test of {count}.", markup=False)
                 result = measure_positions(
-                    manager, plan, output, progress=_quiet, place=placed_by_hand(plan, console),
-                    again=partial(_print_again, console),
-                )  # fmt: skip
+                    manager, plan, output, place=placed_by_hand(plan, console), again=partial(_print_again, console)
+                )
     if as_json:
         typer.echo((output / JSON).read_text(encoding="utf-8"), nl=False)
     else:
@@ -172,8 +172,8 @@ def measure_positions(
     manager: JobManager,
     plan: AcceptancePlan,
     output: Path,
+    listener: Listener = SILENT,
     *,
-    progress: Callable[[str, float, str], None],
     place: Callable[[Step], None] | None = None,
     again: Callable[[Step, SlrigError], None] = lambda _step, _error: None,
 ) -> AcceptanceResult:
@@ -198,11 +198,7 @@ def measure_positions(
                 place(step)
                 tests.measure(test, wait=True, scripted=False)
             job = manager.store.of(test)[-1]
-
-            def overall(stage: str, fraction: float, detail: str, done: int = names.index(step.name)) -> None:
-                progress(stage, (done + fraction) / len(names), detail)
-
-            ended = followed(manager, job.id, overall)
+            ended = followed(manager, job.id, listener.part(names.index(step.name), len(names)))
             if ended.fault is not None:
                 error = error_of(ended.fault)
                 if place is None or not isinstance(error, (NothingToReconstructError, ScanEvidenceError)):
@@ -246,7 +242,3 @@ def tell(result: AcceptanceResult, console: Console) -> None:
 
 def _print_again(console: Console, step: Step, error: SlrigError) -> None:
     console.print(Text(f"{step.name}: {error}", style="red"))
-
-
-def _quiet(_stage: str, _fraction: float, _detail: str, /) -> None:
-    """Prompts and a moving bar do not go together."""

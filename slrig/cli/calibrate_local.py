@@ -31,6 +31,7 @@ from slrig.cli.reconstruct import keep_kernels
 from slrig.config import read_rig
 from slrig.disk import storage_errors
 from slrig.errors import BundleError, CalibrationError, ConfigError, PatternError, PoseRefusedError, SolveRefusedError
+from slrig.jobs.listener import Listener
 from slrig.logs import set_up_console_logs
 from slrig.model import Calibration, Size
 
@@ -123,16 +124,13 @@ def _solved(
         if not found.poses:
             raise PoseRefusedError(_none_left(folder, board, found.refused))
 
-        def solving(stage: str, fraction: float, detail: str) -> None:
-            display(stage, _READING_SHARE + (1 - _READING_SHARE) * fraction, detail)
-
         try:
             result = solve_poses(
                 board,
                 cameras,
                 projector,
                 found.poses,
-                progress=solving,
+                Listener(report=display).within(_READING_SHARE, 1.0),
                 earlier=before,
                 board_shape=board_shape,
                 tolerance_mm=tolerance_mm,
@@ -312,7 +310,7 @@ def verify(source: Path, board: Board, calibration_file: Path | None, *, positio
             verification = verify_bundle(source, board, calibration)
         else:
             given = None if calibration_file is None else _calibration(calibration_file)
-            record = run_job(read_rig(source), VerificationJob(board, position), display, given)
+            record = run_job(read_rig(source), VerificationJob(board, position), Listener(report=display), given)
             verification = verification_from_document((record.summary or {})["found"])
     health = judge_health([verification])
     if as_json:

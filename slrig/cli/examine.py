@@ -37,9 +37,9 @@ from slrig.doctor import (
 )
 from slrig.errors import ConfigError, StorageError
 from slrig.jobs.job import Job
+from slrig.jobs.listener import Listener
 from slrig.jobs.records import JobKind
 from slrig.logs import set_up_console_logs
-from slrig.scan.plan import ProgressCallback
 
 _COLOURS = {
     Severity.OK: "green",
@@ -134,22 +134,22 @@ def _examined(
     """
     with progress_shown() as display:
         if rig_file is None:
-            return examined_by(client, kind, options, display)
+            return examined_by(client, kind, options, Listener(report=display))
         config = read_rig(rig_file)
         display("opening the rig", 0.0, "")
-        record = run_job(config, _job(kind, config, options), display)
+        record = run_job(config, _job(kind, config, options), Listener(report=display))
     found = dict(record.summary or {})
     _keep(data, kind, found)
     return found, None if record.fault is None else record.fault.message
 
 
 def examined_by(
-    client: Client, kind: JobKind, options: Mapping[str, Any], display: ProgressCallback
+    client: Client, kind: JobKind, options: Mapping[str, Any], listener: Listener
 ) -> tuple[dict[str, Any], str | None]:
     """See `_examined`: by the service of a client. Raises ServiceError, ExaminationFailedError."""
     job = client.post(f"/rig/{kind}", options)
     try:
-        job = client.examinations.wait(job["id"], display)
+        job = client.examinations.wait(job["id"], listener.report)
     except KeyboardInterrupt:
         client.examinations.cancel(job["id"])
         raise

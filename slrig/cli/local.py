@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,6 +16,7 @@ from slrig.failure import error_of
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.job import Job
+from slrig.jobs.listener import Listener
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import JobRecord, JobState
 from slrig.jobs.store import JobStore
@@ -52,9 +53,7 @@ def local_manager(config: RigConfig, *kinds: type[Job]) -> Iterator[JobManager]:
             data.release()
 
 
-def run_job(
-    config: RigConfig, job: Job, progress: Callable[[str, float, str], None], calibration: Calibration | None = None
-) -> JobRecord:
+def run_job(config: RigConfig, job: Job, listener: Listener, calibration: Calibration | None = None) -> JobRecord:
     """Do one job with the rig of a file, and return it when it is over. calibration : used in place of the rig's own.
 
     Raises the error by which it ended, unless it left something on record: see its `fault` then. CalibrationError: the
@@ -63,13 +62,13 @@ def run_job(
     with local_manager(config, type(job)) as manager:
         if calibration is not None:
             manager.rig.use_calibration(ActiveCalibration("of the command", calibration))
-        record = followed(manager, manager.submit(job, wait=True)[0].id, progress)
+        record = followed(manager, manager.submit(job, wait=True)[0].id, listener)
     if record.fault is not None and record.summary is None:
         raise error_of(record.fault)
     return record
 
 
-def followed(manager: JobManager, job_id: UUID, progress: Callable[[str, float, str], None]) -> JobRecord:
+def followed(manager: JobManager, job_id: UUID, listener: Listener) -> JobRecord:
     """Follow a job of a manager to its end, and return it."""
     news = threading.Event()
     unwatch = manager.store.watch(job_id, news.set)
@@ -78,9 +77,9 @@ def followed(manager: JobManager, job_id: UUID, progress: Callable[[str, float, 
             at = record.progress
             preparing = record.state is JobState.COMPUTING and manager.worker.loading
             if preparing:
-                progress("preparing", at.fraction, manager.worker.condition)
+                listener.report("preparing", at.fraction, manager.worker.condition)
             else:
-                progress(at.stage, at.fraction, at.detail)
+                listener.report(at.stage, at.fraction, at.detail)
             # What the worker loads is no event.
             news.wait(_LOOK_S if preparing else None)
             news.clear()

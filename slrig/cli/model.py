@@ -15,6 +15,7 @@ import typer
 
 from slrig.cli.options import BoardArguments, ServiceOptions, given, grouped
 from slrig.errors import ConfigError
+from slrig.jobs.listener import Listener
 
 if TYPE_CHECKING:
     from slrig.bundle import TurntableRecord
@@ -156,8 +157,8 @@ def model(
 
         planes = () if no_cut else known.planes
         combine_into(
-            files, folder, start, start_error_mm=start_error_mm, voxel_mm=voxel_mm, planes=planes, notes=notes,
-            progress=display,
+            files, folder, start, Listener(report=display), start_error_mm=start_error_mm, voxel_mm=voxel_mm,
+            planes=planes, notes=notes,
         )  # fmt: skip
         report = json.loads((folder / REPORT).read_bytes())
     _tell_all(report, output)

@@ -22,6 +22,7 @@ from slrig.config import read_rig
 from slrig.devices import Rig, Turntable
 from slrig.discovery import open_rig
 from slrig.errors import ConfigError, ServiceError, SlrigError, ViewsFailedError
+from slrig.jobs.listener import Listener
 from slrig.jobs.records import utc_now
 from slrig.model_jobs.job import TURN
 from slrig.model_jobs.plan import ShootPlan, StartingPoses, StatedAxis, TurntablePoses
@@ -116,12 +117,12 @@ def _shot(rig: Rig, plan: ScanPlan, output: Path, number: int) -> None:
         prepare_kernels(display)
         if not (bundle / DESCRIPTION).is_file():
             try:
-                capture_frames(rig, plan, bundle, progress=display, cancelled=lambda: False).finish()
+                capture_frames(rig, plan, bundle, Listener(report=display)).finish()
             except BaseException:
                 shutil.rmtree(bundle, ignore_errors=True)
                 raise
         folder = output / f"view-{number}"
-        reconstruct_bundle(bundle, folder, plan=plan.reconstruction, progress=display, cancelled=lambda: False)
+        reconstruct_bundle(bundle, folder, Listener(report=display), plan=plan.reconstruction)
 
 
 def views_there(client: Client, request: Mapping[str, Any], output: Path, *, ask: Callable[[str], str] = input) -> None:

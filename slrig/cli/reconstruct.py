@@ -22,12 +22,13 @@ from slrig.cli.scan import quality_lines
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError, ExtraMissingError
 from slrig.failure import UNEXPECTED, job_failure
+from slrig.jobs.listener import Listener
 from slrig.jobs.worker import PREPARING, prepare_kernel_cache
 from slrig.logs import set_up_console_logs
 from slrig.scan.artefacts import MESH, ON_REQUEST, REPORT, write_converted
 from slrig.scan.formats import BUNDLE_ZIP, CALIBRATION_USED, missing_for, offered, on_demand
 from slrig.scan.job import report_summary
-from slrig.scan.plan import ProgressCallback, ReconstructionPlan
+from slrig.scan.plan import ReconstructionPlan
 
 Row = tuple[str, ...]
 """What the table says of a bundle, or of one of its cameras, beside name and seconds; the last cell is a remark."""
@@ -58,9 +59,9 @@ def named_bundles(asked: Sequence[Path]) -> tuple[list[Path], bool]:
 def work_through(
     bundles: Sequence[Path],
     output: Path,
-    work: Callable[[Path, Path, ProgressCallback], Sequence[Row]],
+    work: Callable[[Path, Path, Listener], Sequence[Row]],
     *,
-    prepare: Callable[[ProgressCallback], object] = lambda _: None,
+    prepare: Callable[[ProgressDisplay], object] = lambda _: None,
     heads: Sequence[Column],
     places: Sequence[str],
 ) -> None:
@@ -173,14 +174,14 @@ def _failure_told(bundle: Path, failed: dict[Path, str], display: ProgressDispla
         failed[bundle] = failure.code
 
 
-def _part_of(display: ProgressCallback, place: int, count: int, name: str) -> ProgressCallback:
+def _part_of(display: ProgressDisplay, place: int, count: int, name: str) -> Listener:
     """Progress of one bundle as that of all. place : 1 for the first."""
 
     def told(stage: str, fraction: float, detail: str, /) -> None:
         where = f"{place} of {count}: {name}"
         display(stage, (place - 1 + fraction) / count, f"{where}, {detail}" if detail else where)
 
-    return told
+    return Listener(report=told)
 
 
 def _print_summary(
@@ -211,10 +212,10 @@ def decode_and_tell(asked: Sequence[Path], output: Path) -> None:
     bundles, several = named_bundles(asked)
     if several:
 
-        def decoded(bundle: Path, folder: Path, progress: ProgressCallback) -> list[Row]:
-            progress("decode", 0.0, "")
+        def decoded(bundle: Path, folder: Path, listener: Listener) -> list[Row]:
+            listener.report("decode", 0.0, "")
             found, notes = decode_bundle(bundle, folder)
-            progress("done", 1.0, "")
+            listener.report("done", 1.0, "")
             return [
                 (f"{each.camera}, {each.axis.value}s", f"{each.lit:.0%}", f"{each.decoded:.0%}",
                  "; ".join([*each.advice, *(notes if each is found[0] else ())]))
@@ -256,15 +257,13 @@ def reconstruct_and_tell(
     if calibration is not None:
         read_calibration(calibration)
 
-    def reconstructed(bundle: Path, folder: Path, progress: ProgressCallback) -> dict[str, Any]:
+    def reconstructed(bundle: Path, folder: Path, listener: Listener) -> dict[str, Any]:
         from slrig.scan.reconstruct import reconstruct_bundle
 
         cameras = _require_offered(further, bundle)
-        report = reconstruct_bundle(
-            bundle, folder, plan=plan, calibration=calibration, progress=progress, cancelled=lambda: False
-        )
+        report = reconstruct_bundle(bundle, folder, listener, plan=plan, calibration=calibration)
         for name in further:
-            progress(f"writing {name}", 1.0, "")
+            listener.report(f"writing {name}", 1.0, "")
             _write_further(folder, name, cameras, bundle, calibration)
         return report_summary(report)
 
@@ -280,7 +279,7 @@ def reconstruct_and_tell(
         return
     with progress_shown() as display:
         prepare_kernels(display)
-        summary = reconstructed(bundles[0], output, display)
+        summary = reconstructed(bundles[0], output, Listener(report=display))
     for what, name in files:
         typer.echo(f"{what:<10}{output / name}")
     for line in quality_lines(summary):
@@ -341,7 +340,7 @@ def warm() -> None:
     typer.echo(f"{count} kernels are ready, kept {place} ({time.monotonic() - began_s:.0f} s)")
 
 
-def prepare_kernels(display: ProgressCallback) -> int:
+def prepare_kernels(display: ProgressDisplay) -> int:
     """Compile the kernels of a usual scan that no earlier run has, under progress; return how many there are."""
     keep_kernels()
     display("loading", 0.0, "")

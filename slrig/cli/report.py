@@ -28,9 +28,9 @@ from slrig.discovery import discover_devices, installed_drivers
 from slrig.disk import staging_name, storage_errors
 from slrig.doctor import EXAMINATIONS, refuse_existing
 from slrig.errors import ConfigError, ServiceError, SlrigError, UnsupportedByDeviceError
+from slrig.jobs.listener import Listener
 from slrig.jobs.records import JobKind, utc_now
 from slrig.scan.formats import BUNDLE_ZIP
-from slrig.scan.plan import ProgressCallback
 
 _MEANINGS = {
     "versions.json": "slrig, its packages, Python, the system, the kind of the session on its screen",
@@ -64,21 +64,17 @@ _Files = Mapping[str, str | bytes]
 class _Parts:
     """The parts that were gathered into a ZIP file, and why others are missing."""
 
-    def __init__(self, file: ZipFile, display: ProgressCallback) -> None:
+    def __init__(self, file: ZipFile, listener: Listener) -> None:
         self.missing: dict[str, str] = {}
         self._file = file
-        self._display = display
+        self._listener = listener
 
-    def add(self, name: str, gather: Callable[[ProgressCallback], _Files]) -> None:
+    def add(self, name: str, gather: Callable[[Listener], _Files]) -> None:
         """Add the files of a part, or say why it is missing, and go on."""
-        begun = list(_MEANINGS).index(name)
-
-        def told(stage: str, fraction: float, detail: str) -> None:
-            self._display(f"{name}: {stage}", (begun + fraction) / len(_MEANINGS), detail)
-
-        told("gathering", 0.0, "")
+        part = self._listener.part(list(_MEANINGS).index(name), len(_MEANINGS), name)
+        part.report("gathering", 0.0, "")
         try:
-            files = gather(told)
+            files = gather(part)
         except Exception as error:  # noqa: BLE001 - whatever it is, the other parts can be sent
             self.missing[name] = str(error) if isinstance(error, SlrigError) else f"{type(error).__name__}: {error}"
             return
@@ -108,7 +104,7 @@ def write_report(rig_file: Path | None, service: ServiceOptions, output: Path, *
         scratch = Path(folder)
         try:
             with ZipFile(staging, "w", ZIP_DEFLATED) as file:
-                parts = _Parts(file, display)
+                parts = _Parts(file, Listener(report=display))
                 parts.add("versions.json", lambda _: {"versions.json": _json(_versions())})
                 parts.add("devices.json", lambda _: {"devices.json": _json(_devices())})
                 parts.add("tools.txt", lambda _: {"tools.txt": _tools()})
@@ -138,15 +134,15 @@ def _add_rig(parts: _Parts, client: Client, scratch: Path, *, pictures: bool) ->
     parts.add("rig.json", lambda _: {"rig.json": _json(rig)})
     for kind in EXAMINATIONS:
 
-        def examined(told: ProgressCallback, kind: JobKind = kind) -> _Files:
-            return {f"{kind}.json": _json(examined_by(client, kind, {}, told)[0])}
+        def examined(part: Listener, kind: JobKind = kind) -> _Files:
+            return {f"{kind}.json": _json(examined_by(client, kind, {}, part)[0])}
 
         parts.add(f"{kind}.json", examined)
     files = ("report.json", *(_PICTURES if pictures else ()))
     for name in ("scan-1", "scan-2"):
 
-        def scanned(told: ProgressCallback, name: str = name) -> _Files:
-            scan_with(client, {"label": "slrig report"}, scratch / name, files=files, display=told)
+        def scanned(part: Listener, name: str = name) -> _Files:
+            scan_with(client, {"label": "slrig report"}, scratch / name, part, files=files)
             report = {f"{name}/report.json": (scratch / name / "report.json").read_text(encoding="utf-8")}
             return report | {f"{name}/{each}": (scratch / name / each).read_bytes() for each in files[1:]}
 

@@ -9,7 +9,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,14 +20,14 @@ from rich.table import Column
 
 import slrig
 from slrig import KEY_VARIABLE
-from slrig.cli.display import counted, print_table, progress_shown
+from slrig.cli.display import ProgressDisplay, counted, print_table, progress_shown
 from slrig.cli.options import ServiceOptions
 from slrig.client import Client, ScanJob
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
+from slrig.jobs.listener import Listener
 from slrig.scan.artefacts import truth_notes
 from slrig.scan.formats import camera_prefixes, installed_by, offered
-from slrig.scan.plan import ProgressCallback
 
 
 def quality_lines(summary: Mapping[str, Any]) -> list[str]:
@@ -74,9 +74,9 @@ def scan_with(
     client: Client,
     request: Mapping[str, Any],
     output: Path,
+    listener: Listener | None = None,
     *,
     files: tuple[str, ...] = FILES,
-    display: Callable[[str, float, str], None] | None = None,
 ) -> dict[str, Any]:
     """Scan, fetch the files into `output`, and return the finished scan. Ctrl-C cancels the scan.
 
@@ -90,7 +90,7 @@ def scan_with(
         Somebody else cancelled it.
     """
     _require_offered(client, files)
-    with progress_shown() if display is None else nullcontext(display) as told:
+    with _followed_by(listener) as told:
         job = _started(client, request)
         return _completed(client, job, job.scan["links"]["cancel"], output, files, told)
 
@@ -99,9 +99,9 @@ def series_with(
     client: Client,
     request: Mapping[str, Any],
     output: Path,
+    listener: Listener | None = None,
     *,
     files: tuple[str, ...] = FILES,
-    display: Callable[[str, float, str], None] | None = None,
 ) -> None:
     """Scan a series, fetch the files of each scan into a folder of its number, and print what became of them.
 
@@ -118,17 +118,14 @@ def series_with(
     rows: list[tuple[str, ...]] = []
     failures: list[str] = []
     try:
-        with progress_shown() if display is None else nullcontext(display) as told:
+        with _followed_by(listener) as told:
             job = _started(client, request)
             series, scans = job.scan["links"]["series"], job.series()
             for number, job in enumerate(scans, 1):
                 name = f"{number:0{_DIGITS}}"
-
-                def of_all(stage: str, fraction: float, detail: str, name: str = name) -> None:
-                    told(f"{name} of {len(scans)}: {stage}", fraction, detail)
-
+                one = told.within(0.0, 1.0, f"{name} of {len(scans)}")
                 try:
-                    scan = _completed(client, job, f"{series}/cancel", output / name, files, of_all)
+                    scan = _completed(client, job, f"{series}/cancel", output / name, files, one)
                 except (ServiceError, ScanCancelledError) as error:
                     rows.append((name, "", "", str(error)))
                     failures.append(name)
@@ -163,6 +160,16 @@ def assisted(client: Client, request: Mapping[str, Any], *, budget_s: float | No
     return {**request, **found["scan"]}
 
 
+@contextmanager
+def _followed_by(listener: Listener | None) -> Iterator[Listener]:
+    """The listener, or a display of its own where there is none."""
+    if listener is not None:
+        yield listener
+        return
+    with progress_shown() as display:
+        yield Listener(report=display)
+
+
 def _started(client: Client, request: Mapping[str, Any]) -> ScanJob:
     # Whether it waits for the rig is as the request says, or the service.
     return client.start_scan(**{"if_busy": None, **request})
@@ -174,11 +181,11 @@ def _completed(
     cancel: str,
     output: Path,
     files: Sequence[str],
-    told: Callable[[str, float, str], None],
+    listener: Listener,
 ) -> dict[str, Any]:
     """Follow a scan to its end, fetch its files, and return it. cancel : what Ctrl-C asks for."""
     try:
-        result = job.result(told)
+        result = job.result(listener.report)
     except KeyboardInterrupt:
         with suppress(ServiceError):
             client.post(cancel)
@@ -193,9 +200,9 @@ def _completed(
     with storage_errors(output):
         output.mkdir(parents=True, exist_ok=True)
     for name in files:
-        told(f"fetching {name}", 1.0, "")
+        listener.report(f"fetching {name}", 1.0, "")
         result.save(name, output)
-    told("done", 1.0, "")
+    listener.report("done", 1.0, "")
     return result.scan
 
 
@@ -237,11 +244,7 @@ def run_demo(rig: Path | None, output: Path) -> None:
     rig = _rig_file(rig)
     data = output / "service"
     with progress_shown() as display, rig_service(rig, data, display) as client:
-
-        def shown(stage: str, fraction: float, detail: str) -> None:
-            display(stage, _SERVICE_SHARE + (1 - _SERVICE_SHARE) * fraction, detail)
-
-        scan = scan_with(client, {"label": LABEL}, output, display=shown)
+        scan = scan_with(client, {"label": LABEL}, output, Listener(report=display).within(_SERVICE_SHARE, 1.0))
         removed = remove_earlier(client, scan)
     tell_result(scan, output)
     if removed:
@@ -252,7 +255,7 @@ def run_demo(rig: Path | None, output: Path) -> None:
 
 
 @contextmanager
-def rig_service(rig: Path, data: Path, display: ProgressCallback) -> Iterator[Client]:
+def rig_service(rig: Path, data: Path, display: ProgressDisplay) -> Iterator[Client]:
     """A client of a service that holds the rig of a file as long as the block lasts, in a process of its own.
 
     data : its data folder, which is made. Raises ServiceError: it does not start, or the rig cannot be opened;
@@ -341,7 +344,7 @@ def _url(process: subprocess.Popen[bytes], data: Path) -> str:
     return url
 
 
-def _await_ready(process: subprocess.Popen[bytes], client: Client, data: Path, display: ProgressCallback) -> None:
+def _await_ready(process: subprocess.Popen[bytes], client: Client, data: Path, display: ProgressDisplay) -> None:
     deadline = time.monotonic() + START_LIMIT_S
     told = ""
     while (missing := still_missing(client)) is not None:

@@ -48,6 +48,7 @@ from slrig.errors import ConfigError, ScanCancelledError, WorkerLostError
 from slrig.failure import JobFailure, job_failure
 from slrig.jobs.database import versions
 from slrig.jobs.job import JobRun
+from slrig.jobs.listener import Listener
 from slrig.jobs.worker import POLL_S, READY, Compute, Task, Worker, job_task, prepare_kernel_cache
 from slrig.scan.job import PIPELINE, ScanJob
 from slrig.scan.plan import ScanPlan
@@ -318,7 +319,7 @@ class Host:
         _log.info("computes for a rig", job=order.job, what=given.name)
         tell(Progress(job=order.job))
         # Of the process that computes: after an update of the files beneath, it is newer than this one.
-        if self._worker.run(_VERSIONS, cancelled=stop.is_set) != order.versions:
+        if self._worker.run(_VERSIONS, Listener(cancelled=stop.is_set)) != order.versions:
             message = "the machine's versions of slrig and its libraries have changed; start slrig worker again"
             raise PoolError(message)
 
@@ -338,7 +339,7 @@ class Host:
                 told = detail.replace(f"{scratch}/", "")
                 tell(Progress(job=order.job, stage=stage, fraction=fraction, detail=told))
 
-            run = JobRun(given.id, Path(scratch), None, progress, stop.is_set, evidence=given.evidence)
+            run = JobRun(given.id, Path(scratch), None, evidence=given.evidence)
             task = replace(
                 job_task(ScanJob(given.plan), run), where={"where": "pool"}, remedy="Its rig computes by itself."
             )
@@ -350,7 +351,8 @@ class Host:
                 sent[name] = line.submit(self._store.put_result, order.job, run.result / name, check)
 
             try:
-                result = self._worker.run(task, progress=progress, cancelled=stop.is_set, made=made)
+                listener = Listener(report=progress, cancelled=stop.is_set, file_ready=made)
+                result = self._worker.run(task, listener)
                 # A task that makes no file makes no folder.
                 for path in run.result.glob("*"):
                     if path.name not in sent:

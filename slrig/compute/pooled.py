@@ -40,18 +40,17 @@ from slrig.compute.link import (
 from slrig.compute.security import PoolAddress, pool_address
 from slrig.config import ServiceSettings
 from slrig.disk import storage_errors
-from slrig.errors import ConfigError, ScanCancelledError, StorageError
+from slrig.errors import ConfigError, StorageError
 from slrig.jobs.data_folder import BUNDLE, RESULT
 from slrig.jobs.database import versions
 from slrig.jobs.job import FrameFeed
-from slrig.jobs.worker import POLL_S, Compute, JobFiles, Made, Task, Told, Worker
+from slrig.jobs.listener import SILENT, Listener
+from slrig.jobs.worker import POLL_S, Compute, JobFiles, Task, Worker
 from slrig.model import Region
 from slrig.scan.job import ScanJob
 
 LOOK_S = 2.0
 """How often a pool that is not there is looked for."""
-
-NewsCallback = Callable[[Progress], None]
 
 _log = structlog.get_logger(__name__)
 
@@ -68,7 +67,7 @@ class PoolClient:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._life: asyncio.Task[None] | None = None
         self._link: Link | None = None
-        self._orders: dict[str, tuple[NewsCallback, Future[PoolResponse]]] = {}
+        self._orders: dict[str, tuple[SimpleQueue[Progress], Future[PoolResponse]]] = {}
 
     def start(self) -> None:
         """Begin to connect. Returns at once. Idempotent."""
@@ -79,7 +78,7 @@ class PoolClient:
         """Wait at most so long until orders can be given; return whether they can."""
         return self._usable.wait(timeout_s)
 
-    def submit(self, order: PoolRequest, told: NewsCallback) -> Future[PoolResponse]:
+    def submit(self, order: PoolRequest, told: SimpleQueue[Progress]) -> Future[PoolResponse]:
         """Give an order, which is withdrawn where the future is cancelled. Its exception is a PoolError. told : takes
         progress. Raises PoolError.
         """
@@ -129,7 +128,7 @@ class PoolClient:
             case Workers(versions=found):
                 self._note(self._lack(found))
             case Progress(job=job) if job in self._orders:
-                self._orders[job][0](message)
+                self._orders[job][0].put(message)
             case PoolResponse(job=job) if job in self._orders:
                 _settle(self._orders.pop(job)[1], message)
 
@@ -152,7 +151,7 @@ class PoolClient:
         self.fault = fault
         self._usable.clear()
 
-    def _give(self, order: PoolRequest, told: NewsCallback, coming: Future[PoolResponse]) -> None:
+    def _give(self, order: PoolRequest, told: SimpleQueue[Progress], coming: Future[PoolResponse]) -> None:
         if self._link is None:
             _settle(coming, PoolError(self.fault))
         else:
@@ -228,10 +227,8 @@ class PooledWorker:
     def run(
         self,
         task: Task,
+        listener: Listener = SILENT,
         *,
-        progress: Told = lambda *_: None,
-        cancelled: Callable[[], bool] = lambda: False,
-        made: Made = lambda _: None,
         feed: FrameFeed | None = None,
         within_s: float | None = None,
     ) -> Any:
@@ -243,12 +240,12 @@ class PooledWorker:
                 if feed is not None and feed.receiver is not None:
                     # Frames that the local process has taken already are half of its work.
                     raise PoolError(f"{self._pool.fault} when the frames came")  # noqa: TRY301
-                return self._by_pool(task, job, task.files, progress, cancelled, made)
+                return self._by_pool(task, job, task.files, listener)
             except (PoolError, StorageError) as error:
                 if not self._closed:
                     _log.warning("a job is computed by this machine", job=task.what, cause=str(error))
                 task = replace(task, where={"where": "local", "because": str(error)})
-        return self._local.run(task, progress=progress, cancelled=cancelled, made=made, feed=feed, within_s=within_s)
+        return self._local.run(task, listener, feed=feed, within_s=within_s)
 
     def close(self) -> None:
         """See `Compute`."""
@@ -257,9 +254,7 @@ class PooledWorker:
         self._pool.close()
         self._tidying.shutdown(wait=False, cancel_futures=True)
 
-    def _by_pool(
-        self, task: Task, job: ScanJob, files: JobFiles, progress: Told, cancelled: Callable[[], bool], made: Made
-    ) -> Any:
+    def _by_pool(self, task: Task, job: ScanJob, files: JobFiles, listener: Listener) -> Any:
         if not self._pool.usable():
             raise PoolError(self._pool.fault)
         bundle, result, key = files.folder / BUNDLE, files.folder / RESULT, None
@@ -268,10 +263,10 @@ class PooledWorker:
         try:
             for left in reversed(range(TRIES)):
                 try:
-                    progress(WAITING, 0.0, "")
-                    key = self._store.put_bundle(bundle, self._check(task, cancelled))
+                    listener.report(WAITING, 0.0, "")
+                    key = self._store.put_bundle(bundle, self._check(task, listener))
                     wanted = PoolTask(id=files.id, bundle=key, plan=job.plan, evidence=files.evidence)
-                    return self._tried(task, wanted, result, progress, cancelled, made)
+                    return self._tried(task, wanted, result, listener)
                 except PoolError as error:
                     if error.final or not left or self._closed or not self._pool.usable(RETURN_LIMIT_S):
                         raise
@@ -280,30 +275,23 @@ class PooledWorker:
             if key is not None:
                 self._tidy(partial(self._store.clear, bundle=key))
 
-    def _tried(
-        self, task: Task, wanted: PoolTask, result: Path, progress: Told, cancelled: Callable[[], bool], made: Made
-    ) -> Any:
+    def _tried(self, task: Task, wanted: PoolTask, result: Path, listener: Listener) -> Any:
         order = PoolRequest(job=uuid4().hex, versions=dict(versions()), task=wanted.model_dump(mode="json"))
         told: SimpleQueue[Progress] = SimpleQueue()
-        coming = self._pool.submit(order, told.put)
+        coming = self._pool.submit(order, told)
         try:
-            answer = self._answer(task, coming, told, progress, cancelled)
+            answer = self._answer(task, coming, told, listener)
             if answer.fault is not None:
                 raise PoolError(answer.fault.message, final=answer.fault.code != POOL_FAULT)
-            for name in self._store.fetch_result(order.job, answer.files, result, self._check(task, cancelled)):
-                made(name)
+            for name in self._store.fetch_result(order.job, answer.files, result, self._check(task, listener)):
+                listener.file_ready(name)
             return answer.result
         finally:
             coming.cancel()
             self._tidy(partial(self._store.clear, job=order.job))
 
     def _answer(
-        self,
-        task: Task,
-        coming: Future[PoolResponse],
-        told: SimpleQueue[Progress],
-        progress: Told,
-        cancelled: Callable[[], bool],
+        self, task: Task, coming: Future[PoolResponse], told: SimpleQueue[Progress], listener: Listener
     ) -> PoolResponse:
         given_s, begun = self._clock(), False
         while True:
@@ -313,30 +301,28 @@ class PooledWorker:
             while not told.empty():
                 heard, begun = told.get(), True
                 if heard.stage:
-                    progress(heard.stage, heard.fraction, heard.detail)
+                    listener.report(heard.stage, heard.fraction, heard.detail)
             if answer is not None:
                 return answer
-            self._stay(task, cancelled)
+            self._stay(task, listener)
             if not begun and self._clock() - given_s > BEGIN_LIMIT_S:
                 message = f"the job has not begun in the pool for {self._clock() - given_s:.0f} s"
                 # In a pool that has too much to do, a second try would wait behind all others once more.
                 raise PoolError(message, final=True)
 
-    def _stay(self, task: Task, cancelled: Callable[[], bool]) -> None:
+    def _stay(self, task: Task, listener: Listener) -> None:
         """Raise what ends the wait for the pool."""
-        if cancelled():
-            message = f"The {task.what} was cancelled."
-            raise ScanCancelledError(message)
+        listener.check(f"The {task.what} was cancelled.")
         if self._closed:
             message = "the service ends"
             raise PoolError(message)
 
-    def _check(self, task: Task, cancelled: Callable[[], bool]) -> Callable[[], None]:
+    def _check(self, task: Task, listener: Listener) -> Callable[[], None]:
         """What ends a transfer to or from the store that begins now."""
         until_s = self._clock() + TRANSFER_LIMIT_S
 
         def check() -> None:
-            self._stay(task, cancelled)
+            self._stay(task, listener)
             if self._clock() > until_s:
                 message = f"the store {self._store.address} took longer than {TRANSFER_LIMIT_S:.0f} s"
                 raise PoolError(message)

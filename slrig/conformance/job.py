@@ -28,7 +28,7 @@ class ConformanceJob(Job):
         """
         sequence = rig_sequence(ScanPlan(patterns=self.patterns), rig.open())
         report = run_checks(
-            rig.open_for_checks, sequence, progress=run.step, calls=rig.calls,
+            rig.open_for_checks, sequence, run, calls=rig.calls,
             found=lambda report: run.found(report.document()),
         )  # fmt: skip
         return Outcome(report.document())

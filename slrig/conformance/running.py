@@ -18,6 +18,7 @@ from slrig.conformance import camera_checks, device_checks, rig_checks
 from slrig.conformance.bench import Check, ExpectationError, Failure, NotApplicableError, RigBench, failure_from
 from slrig.devices import Rig
 from slrig.errors import DeviceError
+from slrig.jobs.listener import SILENT, Listener
 from slrig.model import PatternSequence
 from slrig.rig.watchdog import Calls
 
@@ -33,8 +34,6 @@ OPENING_LIMIT_S = 120.0
 CHECK_LIMIT_S = 60.0
 _CLOSING_LIMIT_S = 10.0
 _EXPOSURES_PER_PATTERN = 8  # more than any check makes
-
-ProgressCallback = Callable[[str, float, str], None]
 
 _Answer = TypeVar("_Answer")
 
@@ -124,8 +123,8 @@ class ConformanceReport:
 def run_checks(
     open_rig: Callable[[], Rig],
     sequence: PatternSequence,
+    listener: Listener = SILENT,
     *,
-    progress: ProgressCallback = lambda _stage, _fraction, _detail: None,
     checks: Sequence[Check] = CHECKS,
     limit_s: float | None = None,
     calls: Calls | None = None,
@@ -134,8 +133,8 @@ def run_checks(
     """Examine a rig by every check.
 
     open_rig : opens the rig; called several times, each time after the rig was closed. sequence : patterns that its
-    projector can show, white and black first. progress : called with the check, the fraction done and a detail before
-    and after each check, in the caller's thread. limit_s : time limit of a check; None is a minute, and more for long
+    projector can show, white and black first. listener : is told before and after each check, in the caller's thread,
+    where it may have the examination end. limit_s : time limit of a check; None is a minute, and more for long
     exposures. calls : see `ConformanceRun`. found : called before each check with the report as it is if that check
     does not return.
     Raises the errors of opening the rig for the first time.
@@ -144,12 +143,12 @@ def run_checks(
     results: list[CheckResult] = []
     with ConformanceRun(open_rig, sequence, limit_s=limit_s, calls=calls) as run:
         for count, each in enumerate(checks):
-            progress(each.title, count / len(checks), "")
+            listener.step(each.title, count / len(checks), "")
             hangs = f"'{each.title}' did not return"
             unfinished = [_not_run(check, hangs) for check in checks[count:]]
             found(ConformanceReport(run.name, (*results, *unfinished), time.monotonic() - start_s, hangs))
             results.append(run.run_check(each))
-            progress(each.title, (count + 1) / len(checks), results[-1].outcome)
+            listener.step(each.title, (count + 1) / len(checks), results[-1].outcome)
         return ConformanceReport(run.name, tuple(results), time.monotonic() - start_s, run.stopped)
 
 

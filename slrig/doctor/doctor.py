@@ -47,10 +47,9 @@ from slrig.doctor.light import (
 )
 from slrig.doctor.measures import ResponseCurve
 from slrig.errors import DeviceError, DeviceGoneError, UnsupportedByDeviceError
+from slrig.jobs.listener import SILENT, Listener
 from slrig.model import PatternSequence, Size
 from slrig.patterns import encode, scan_patterns
-
-ProgressCallback = Callable[[str, float, str], None]
 
 _Value = TypeVar("_Value")
 
@@ -134,6 +133,7 @@ def doctor_sequence(size: Size) -> PatternSequence:
 
 def examine(
     rig: Rig,
+    listener: Listener = SILENT,
     *,
     own_sequence: PatternSequence,
     displays: Sequence[FoundDevice] = (),
@@ -141,7 +141,6 @@ def examine(
     steps: int = DEFAULT_PERIOD_PX,
     sines: bool = False,
     search_s: float = DEFAULT_SEARCH_S,
-    progress: ProgressCallback = lambda _stage, _fraction, _detail: None,
 ) -> Diagnosis:
     """Examine an open rig. In every case the projector is dark and the cameras are disarmed afterwards.
 
@@ -149,9 +148,9 @@ def examine(
     displays : projectors and outputs that the finders found, including the rig's own.
     period_px : distance of the lines that this rig scans with; steps : number of frames of them. sines : it scans with
     sinusoids of that period in place of lines.
-    search_s : longest latency to search for. progress : called with the stage, the fraction done, and a detail.
+    search_s : longest latency to search for.
     """
-    run = _DoctorRun(rig, own_sequence, displays, period_px, steps, sines, search_s, progress)
+    run = _DoctorRun(rig, own_sequence, displays, period_px, steps, sines, search_s, listener)
     try:
         run.run()
     finally:
@@ -174,7 +173,7 @@ class _DoctorRun:
     steps: int
     sines: bool
     search_s: float
-    progress: ProgressCallback
+    listener: Listener
 
     def __post_init__(self) -> None:
         self.findings: list[Finding] = []
@@ -205,7 +204,7 @@ class _DoctorRun:
         ):
             checks.append(("trigger pulses", self._measure_pulses))
         for number, (stage, check) in enumerate(checks):
-            self.progress(stage, number / len(checks), "")
+            self.listener.step(stage, number / len(checks), "")
             try:
                 check()
             except DeviceError as error:
@@ -291,7 +290,7 @@ class _DoctorRun:
             for name, light in self.lights.items()
         }
         self.latency, findings = timing.measure_light_latency(
-            self.rig, self.lights, scans_s, search_s=self.search_s, progress=self.progress
+            self.rig, self.lights, scans_s, self.listener, search_s=self.search_s
         )
         self.findings += findings
         if self.refresh_hz is not None:

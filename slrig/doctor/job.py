@@ -55,13 +55,13 @@ class DoctorJob(Job):
         lines = self.patterns.named
         diagnosis = examine(
             self._as_scanned(opened),
+            run,
             own_sequence=rig_sequence(ScanPlan(patterns=self.patterns), opened),
             displays=displays,
             period_px=lines.period_px,
             steps=lines.steps or lines.period_px,
             sines=lines.sines,
             search_s=self.search_s,
-            progress=run.step,
         )
         return Outcome(diagnosis.document())
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -26,6 +26,7 @@ from slrig.capture import CameraLatency, LatencyMeasurement, measure_latency, me
 from slrig.devices import CameraSettings, Rig, Synchronisation
 from slrig.doctor.light import CameraSession, Finding, LightMeasurement, camera_label, fault, format_ms, note, ok
 from slrig.errors import ScanEvidenceError
+from slrig.jobs.listener import SILENT, Listener
 from slrig.model import Black, FloatArray, Frame, PatternSequence, Size, White
 
 _SHOWS = 48
@@ -124,9 +125,9 @@ def measure_light_latency(
     rig: Rig,
     lights: Mapping[str, LightMeasurement],
     scans_s: Mapping[str, float],
+    listener: Listener = SILENT,
     *,
     search_s: float,
-    progress: Callable[[str, float, str], None],
 ) -> tuple[LatencyMeasurement | None, list[Finding]]:
     """Flash the projector before the cameras that see it; the measurement is None if no camera sees a flash happen.
 
@@ -142,11 +143,11 @@ def measure_light_latency(
     scanning = replace(watching, settings=as_scanned)
     try:
         try:
-            measured = measure_latency(scanning, trials=_FLASHES, search_s=search_s, on_progress=progress)
+            measured = measure_latency(scanning, trials=_FLASHES, search_s=search_s, on_progress=listener.step)
         except ScanEvidenceError:
             if scanning.settings == watching.settings:
                 raise
-            measured = measure_latency(watching, trials=_FLASHES, search_s=search_s, on_progress=progress)
+            measured = measure_latency(watching, trials=_FLASHES, search_s=search_s, on_progress=listener.step)
     except ScanEvidenceError as error:
         return None, [check_punctuality(watching, each, error) for each in lights.values()]
     findings = [

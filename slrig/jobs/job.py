@@ -17,10 +17,11 @@ import structlog
 from pydantic import TypeAdapter
 
 from slrig.capture import EvidenceSummary
-from slrig.errors import DamagedError, ScanCancelledError, StorageError
+from slrig.errors import DamagedError, StorageError
 from slrig.failure import JobFailure
 from slrig.jobs.data_folder import BUNDLE, RESULT, DataFolder
 from slrig.jobs.database import UNREADABLE
+from slrig.jobs.listener import Listener
 from slrig.jobs.records import JobKind, JobProgress, JobRecord
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration, CaptureHeader, Region, Shot
@@ -224,41 +225,26 @@ class Outcome:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class JobRun:
-    """Folder, callbacks and state of one running job: with the rig, then in the worker.
+class JobRun(Listener):
+    """Folder and state of one running job, and who follows it: with the rig, then in the worker.
 
     folder : where its files are made; it is moved to `place` as a whole when the job has come to its end. place : None
-    where nothing is kept. report : takes the stage, the fraction of this part that is done, and a detail for people.
-    file_ready : takes the name of a file that can be fetched before the job is over. frames : takes the frames of a
-    capture while they come; None where they are not computed meanwhile. live : in the worker, the scan that took them.
-    evidence : what the frames proved as they were captured. where : where it is computed, for a report. pipeline : the
-    module that the worker has prepared: `slrig.scan.reconstruct`. found : takes the summary as it is so far, which
-    stays on record where the capture ends by an error.
+    where nothing is kept. frames : takes the frames of a capture while they come; None where they are not computed
+    meanwhile. live : in the worker, the scan that took them. evidence : what the frames proved as they were captured.
+    where : where it is computed, for a report. pipeline : the module that the worker has prepared:
+    `slrig.scan.reconstruct`. found : takes the summary as it is so far, which stays on record where the capture ends by
+    an error.
     """
 
     id: UUID
     folder: Path
     place: Path | None
-    report: Callable[[str, float, str], None]
-    cancelled: Callable[[], bool]
-    file_ready: Callable[[str], None] = lambda _: None
     frames: FrameSink | None = None
     live: Any = None
     evidence: EvidenceSummary | None = None
     where: Mapping[str, str] = field(default_factory=lambda: {"where": "local"})
     pipeline: Any = None
     found: Callable[[Mapping[str, Any]], None] = lambda _: None
-
-    def check(self) -> None:
-        """Raise ScanCancelledError once the job is to end early."""
-        if self.cancelled():
-            message = "It was cancelled."
-            raise ScanCancelledError(message)
-
-    def step(self, stage: str, fraction: float, detail: str, /) -> None:
-        """Report progress, and raise ScanCancelledError once the job is to end early."""
-        self.report(stage, fraction, detail)
-        self.check()
 
     @property
     def recording(self) -> Path:
@@ -449,7 +435,7 @@ class ProgressRecorder:
         self._recorded("that the rig is free of a job could not be told", lambda: self._store.captured(self._job_id))
 
     def __call__(self, stage: str, fraction: float, detail: str) -> None:
-        """Take note, as `slrig.scan.plan.ProgressCallback` asks. A record that is refused fails no work: see the
+        """Take note, as `Listener.report` does. A record that is refused fails no work: see the
         log.
         """
         if self._attempt and not stage.startswith("waiting"):

@@ -37,6 +37,7 @@ from slrig.errors import (
 from slrig.failure import UNEXPECTED, JobFailure, LastingThread, as_error, interruption_error, job_failure
 from slrig.jobs.data_folder import BUNDLE, DataFolder, read_entries, require_files
 from slrig.jobs.job import FrameFeed, Group, Job, JobRun, Outcome, ProgressRecorder, Recording, due_s
+from slrig.jobs.listener import Listener
 from slrig.jobs.records import (
     Holder,
     JobKind,
@@ -136,7 +137,7 @@ class _NoJob(Job):
 class _Loan(_Work):
     """The rig lent to a caller, who waits until `over`."""
 
-    use: Callable[[RigSession, Callable[[], bool]], Any] = lambda _rig, _cancelled: None
+    use: Callable[[RigSession, Listener], Any] = lambda _rig, _listener: None
     result: Any = None
     over: threading.Event = field(default_factory=threading.Event)
 
@@ -249,11 +250,11 @@ class JobManager:
             self._previews.interrupt()
         return records
 
-    def lend(self, holder: Holder, use: Callable[[RigSession, Callable[[], bool]], _Result]) -> _Result:
+    def lend(self, holder: Holder, use: Callable[[RigSession, Listener], _Result]) -> _Result:
         """Have the rig used on its thread for some seconds, now or not at all, and return what came of it.
 
-        use : is given the rig, to be opened, and whether it is to end early. Nothing is on record. Raises what that
-        raises, and RigBusyError and DeviceError as `submit`.
+        use : is given the rig, to be opened, and who says whether it is to end early. Nothing is on record. Raises what
+        that raises, and RigBusyError and DeviceError as `submit`.
         """
         loan = _Loan(uuid4(), _NoJob(), holder, utc_now(), resumable=False, use=use)
         with self._changed:
@@ -596,7 +597,7 @@ class JobManager:
         if isinstance(work, _Loan):
             try:
                 with driver_errors(rig.name):
-                    work.result = work.use(rig, work.stop.is_set)
+                    work.result = work.use(rig, Listener(cancelled=work.stop.is_set))
             except Exception as error:
                 rig.doubt(error)
                 raise
@@ -718,9 +719,7 @@ class JobManager:
         data.clear_results(work.id)
         run = self._run_of(work, self._progress(work, job.capture_share, 1.0, attempt=True))
         run.check()
-        outcome: Outcome = self.worker.run(
-            job_task(job, run), progress=run.report, cancelled=run.cancelled, made=run.file_ready, feed=work.feed
-        )
+        outcome: Outcome = self.worker.run(job_task(job, run), run, feed=work.feed)
         made = run.result if run.result.is_dir() else run.folder
         if outcome.fault is None:
             require_files(made, job.promises, job.noun)
@@ -751,9 +750,9 @@ class JobManager:
             work.id,
             self.data.staging(work.id),
             work.job.place(self.data, work.id),
-            progress,
-            work.stop.is_set,
-            progress.file_made,
+            report=progress,
+            cancelled=work.stop.is_set,
+            file_ready=progress.file_made,
             frames=feed,
             evidence=None if feed is None else feed.evidence,
             found=found,

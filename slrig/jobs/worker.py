@@ -33,6 +33,7 @@ from slrig.capture import EvidenceSummary
 from slrig.errors import ScanCancelledError, WorkerBusyError, WorkerLostError
 from slrig.failure import JobFailure, errors_by_code, interruption_error, job_failure
 from slrig.jobs.job import FedCaptures, FrameFeed, Job, JobRun
+from slrig.jobs.listener import SILENT, Listener
 from slrig.logs import LogSettings, set_up_logs
 from slrig.model import Region
 
@@ -246,7 +247,7 @@ def _answer(pipe: Connection, stops: Connection, run: RunTask, pipeline: Any, li
         if files is None:
             return Done(run.number, task.function(*task.given))
         job_run = JobRun(
-            files.id, files.folder, files.place, progress, cancelled, made,
+            files.id, files.folder, files.place, report=progress, cancelled=cancelled, file_ready=made,
             live=live, evidence=files.evidence, where=task.where, pipeline=pipeline,
         )  # fmt: skip
         return Done(run.number, task.function(job_run))
@@ -273,12 +274,6 @@ PREPARING = "preparing kernels"
 
 POLL_S = 0.1
 
-Told = Callable[[str, float, str], None]
-"""Is told the stage of a job, the fraction of it that is done, and a detail for people."""
-
-Made = Callable[[str], None]
-"""Is told the name of a file that is there, whole, while the job goes on."""
-
 
 @dataclass(slots=True)
 class JobWait:
@@ -292,9 +287,7 @@ class JobWait:
     pipe: Connection
     stops: Connection
     heartbeat: c_double
-    progress: Told
-    cancelled: Callable[[], bool]
-    made: Made
+    listener: Listener
     noted: Callable[[object | None], None]
     answered: bool = False
     _answer: Done | Failed | None = None
@@ -330,9 +323,9 @@ class JobWait:
             match received(self.pipe):
                 case Progressed(number, stage, fraction, detail) if number == self.number:
                     self._standstill_s = 0.0
-                    self.progress(stage, fraction, detail)
+                    self.listener.report(stage, fraction, detail)
                 case FileMade(number, name) if number == self.number:
-                    self.made(name)
+                    self.listener.file_ready(name)
                 case Done(number) | Failed(number) as answer if number == self.number:
                     self.answered, self._answer = True, answer
                 case Progressed() | FileMade() | Done() | Failed():
@@ -344,7 +337,7 @@ class JobWait:
                     self._standstill_s = 0.0
                     self.noted(told)
                     if isinstance(told, Preparing):
-                        self.progress(PREPARING, 0.0, str(told))
+                        self.listener.report(PREPARING, 0.0, str(told))
 
     def _watch(self) -> bool:
         """Have the process stop when the job is cancelled, and end it when it does not, or is dead or stuck. Returns
@@ -366,7 +359,7 @@ class JobWait:
             _log.warning("a job did not stop when asked, its process is ended", job=self.task.what)
             message = f"The {self.task.what} was cancelled."
             raise ScanCancelledError(message)
-        if self._stop_after is None and self.cancelled():
+        if self._stop_after is None and self.listener.cancelled():
             self._stop_after = now_s + CANCEL_LIMIT_S
             sent(self.stops, self.number)
         return self._stop_after is not None
@@ -407,18 +400,6 @@ _log = structlog.get_logger(__name__)
 
 class UnexpectedWorkerError(Exception):
     """A defect in a task. Carries the traceback of the other process as its text."""
-
-
-def _silent(_stage: str, _fraction: float, _detail: str) -> None:
-    pass
-
-
-def _unheard(_file: str) -> None:
-    pass
-
-
-def _never() -> bool:
-    return False
 
 
 class Worker:
@@ -542,16 +523,13 @@ class Worker:
     def run(
         self,
         task: Task,
+        listener: Listener = SILENT,
         *,
-        progress: Told = _silent,
-        cancelled: Callable[[], bool] = _never,
-        made: Made = _unheard,
         feed: FrameFeed | None = None,
         within_s: float | None = None,
     ) -> Any:
         """Do a task when it is its turn, and return its result. Frames that `feed` has sent, all of them, are used.
-        made : is told the name of each file of the result that is there before the task is over. within_s : the longest
-        wait for its beginning, None for any.
+        within_s : the longest wait for its beginning, None for any.
 
         Whatever but an answer ends the wait, the process is replaced: what it still computes belongs to nobody.
 
@@ -560,7 +538,7 @@ class Worker:
         SlrigError
             Whatever the task raised, by class and message.
         ScanCancelledError
-            `cancelled` turned true.
+            The listener had it cancelled.
         ScanInterruptedError
             The worker was closed.
         WorkerBusyError
@@ -571,7 +549,7 @@ class Worker:
             The task has a defect.
         """
         until_s = None if within_s is None else time.monotonic() + within_s
-        with self._its_turn(task, progress, cancelled, until_s):
+        with self._its_turn(task, listener, until_s):
             self.start()
             if until_s is not None:
                 self._wait_until_ready(task, until_s)
@@ -584,7 +562,7 @@ class Worker:
             # A process that was started since the capture has not seen its frames.
             if feed is not None and feed.receiver is pipe:
                 number, fed = feed.number, True
-            job = JobWait(task, number, process, pipe, stops, self._heartbeat, progress, cancelled, made, self._noted)
+            job = JobWait(task, number, process, pipe, stops, self._heartbeat, listener, self._noted)
             try:
                 if fed and feed is not None:
                     fed = job.settled(feed)
@@ -617,9 +595,7 @@ class Worker:
             self._note(told)
 
     @contextmanager
-    def _its_turn(
-        self, task: Task, progress: Told, cancelled: Callable[[], bool], until_s: float | None
-    ) -> Iterator[None]:
+    def _its_turn(self, task: Task, listener: Listener, until_s: float | None) -> Iterator[None]:
         """Wait until the jobs that came before are over."""
         turn, told = next(self._numbers), False
         with self._turn:
@@ -630,11 +606,9 @@ class Worker:
                     if self._turn.wait_for(lambda: self._turns[0] == turn, timeout=POLL_S):
                         break
                 if not told:
-                    progress(WAITING, 0.0, "another job is computed first")
+                    listener.report(WAITING, 0.0, "another job is computed first")
                     told = True
-                if cancelled():
-                    message = f"The {task.what} was cancelled."
-                    raise ScanCancelledError(message)
+                listener.check(f"The {task.what} was cancelled.")
                 if until_s is not None and time.monotonic() > until_s:
                     message = f"Another job is computed, and the {task.what} has to wait for it. Ask again."
                     raise WorkerBusyError(message)
@@ -712,10 +686,8 @@ class Compute(Protocol):
     def run(
         self,
         task: Task,
+        listener: Listener = ...,
         *,
-        progress: Told = ...,
-        cancelled: Callable[[], bool] = ...,
-        made: Made = ...,
         feed: FrameFeed | None = None,
         within_s: float | None = None,
     ) -> Any:

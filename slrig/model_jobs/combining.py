@@ -24,7 +24,8 @@ from slrig.calibration.detection import (
 )
 from slrig.calibration.printing import marker_dictionary
 from slrig.disk import storage_errors
-from slrig.errors import BundleError, ConfigError, InvalidInputError, ScanCancelledError
+from slrig.errors import BundleError, ConfigError, InvalidInputError
+from slrig.jobs.listener import SILENT, Listener
 from slrig.kernels import report_compilations
 from slrig.meshing import open_borders, used_vertices
 from slrig.model import AlbedoMark, FloatArray, Mesh, Pinhole, Pixels, RotationAxis, Size, TurntablePlane, White
@@ -66,7 +67,6 @@ from slrig.reconstruction import pixel_rays, project
 from slrig.scan.artefacts import MESH, decode_mesh_ply, encode_mesh_ply, encode_report
 from slrig.scan.formats import encode_coarse_glb, encode_mesh_glb, encode_view_glb
 from slrig.scan.pictures import Picture, captioned, draw_scale, encode_png, shaded, side_by_side
-from slrig.scan.plan import ProgressCallback
 
 _REACH = 0.7
 """Of a module, from a marker's corner: inwards is its border, one wide, outwards paper, by a ChArUco board's least."""
@@ -238,13 +238,12 @@ def combine_into(
     meshes: Mapping[str, Path],
     folder: Path,
     poses: StartingPoses,
+    listener: Listener = SILENT,
     *,
     start_error_mm: float = START_ERROR_MM,
     voxel_mm: float | None = None,
     planes: Sequence[TurntablePlane] = (),
     notes: Sequence[str] = (),
-    progress: ProgressCallback,
-    cancelled: Callable[[], bool] = lambda: False,
 ) -> None:
     """Make one model of the meshes of several views, in the frame of the first, and write its files into a folder that
     only its maker knows yet; see `slrig.model_jobs.job`.
@@ -271,7 +270,7 @@ def combine_into(
     NothingToReconstructError
         No view has a triangle, or the voxels are larger than what was seen.
     ScanCancelledError
-        `cancelled()` became true.
+        The listener had it cancelled.
     StorageError
         The disk refused.
     """
@@ -279,14 +278,12 @@ def combine_into(
 
     def entered(stage: str, fraction: float, detail: str = "") -> None:
         nonlocal at
-        if cancelled():
-            message = f"the model was cancelled before '{stage}'"
-            raise ScanCancelledError(message)
+        listener.check(f"the model was cancelled before '{stage}'")
         at = (stage, fraction)
-        progress(stage, fraction, detail)
+        listener.report(stage, fraction, detail)
 
     def compiling(kernel: str) -> None:
-        progress(*at, f"preparing kernels, first time only: {kernel}")
+        listener.report(*at, f"preparing kernels, first time only: {kernel}")
 
     with report_compilations(compiling):
         names, views, removed, seen = list(meshes), [], [], list[MarkerObservations]()
@@ -333,7 +330,7 @@ def combine_into(
         }
         for name, encoded in files.items():
             write_file(folder / name, encoded(), durable=False)
-    progress("done", 1.0, f"{len(whole.mesh.faces)} triangles")
+    listener.report("done", 1.0, f"{len(whole.mesh.faces)} triangles")
 
 
 def read_mesh(file: Path) -> Mesh:

@@ -148,12 +148,11 @@ class ModelJob(Job):
             meshes,
             run.folder,
             plan.poses,
+            run,
             start_error_mm=plan.start_error_mm,
             voxel_mm=plan.voxel_mm,
             planes=TurntableStore(data / TURNTABLE).planes() if plan.cut else (),
             notes=plan.notes,
-            progress=run.report,
-            cancelled=run.cancelled,
         )
         return Outcome(summary(run.folder))
 

@@ -24,7 +24,7 @@ export function Trend({title, points, limits}) {
   }, []);
   const highest = Math.max(...points.map(({value}) => value));
   const near = limits.filter(([value]) => value <= 4 * highest);
-  const most = Math.max(highest, ...near.map(([value]) => value), 1e-9) * 1.08;
+  const most = Math.max(highest, ...near.map(([value]) => value), 1e-3) * 1.08;
   const step = round(most);
   const [first, last] = [points[0].at, points.at(-1).at];
   const x = (at) => LEFT + (width - LEFT - RIGHT) * (last > first ? (at - first) / (last - first) : 0.5);

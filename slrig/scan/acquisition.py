@@ -10,7 +10,7 @@ from __future__ import annotations
 import queue
 import threading
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -52,9 +52,10 @@ from slrig.devices import Camera, CameraSettings, Rig, Trigger, Turntable
 from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError
 from slrig.failure import disk_errors
 from slrig.jobs.job import FrameSink
+from slrig.jobs.listener import SILENT, Listener
 from slrig.model import Black, CaptureHeader, PatternSequence, Pixels, Shot, Truth, White
 from slrig.rig.session import CountedTurntable
-from slrig.scan.plan import ProgressCallback, ScanPlan, in_colour, no_turntable, rig_sequence
+from slrig.scan.plan import ScanPlan, in_colour, no_turntable, rig_sequence
 
 
 @dataclass(slots=True)
@@ -78,8 +79,8 @@ class Exposing:
     ----------
     exposures_s
         From short to long, for every camera; empty leaves each as its rig file has it.
-    refused
-        Is told of every exposure that does not count.
+    recorder
+        Is given every exposure that does not count.
     colour
         Cameras whose white and black frames are kept in colour, too.
     """
@@ -89,16 +90,16 @@ class Exposing:
         rig: Rig,
         sequence: PatternSequence,
         exposures_s: Sequence[float],
+        listener: Listener,
+        recorder: Recorder,
         *,
-        cancelled: Callable[[], bool],
-        refused: Callable[[RefusedFrame], None],
         colour: Collection[str] = (),
     ) -> None:
         self._rig = rig
         self._sequence = sequence
         self._exposures_s: tuple[float | None, ...] = tuple(exposures_s) or (None,)
-        self._cancelled = cancelled
-        self._tell = refused
+        self._listener = listener
+        self._recorder = recorder
         self._colour = colour
         self._formats = {name: camera.info.format for name, camera in rig.cameras.items()}
         self._samplers = (
@@ -185,7 +186,7 @@ class Exposing:
         shots = capture(
             self._set_to(run.exposure_s, taking),
             self._sequence,
-            cancelled=self._cancelled,
+            cancelled=self._listener.cancelled,
             evidence=run.evidence,
             refused=lambda refused: self._take_refusal(run, refused),
             since_ns=since_ns,
@@ -237,7 +238,7 @@ class Exposing:
 
     def _note(self, refused: RefusedFrame) -> None:
         self._refused.append(refused)
-        self._tell(refused)
+        self._recorder.add(refused)
 
     def _unfit(self, run: _BracketRun, taking: Sequence[str]) -> dict[str, ExposureVerdict]:
         """The cameras to which this exposure is of no use, and why."""
@@ -362,13 +363,19 @@ class Recorder:
     def __enter__(self) -> Self:
         return self
 
-    def add(self, shot: Shot) -> None:
-        """Have a frame written; waits while too many are waiting already. Raises as `BundleWriter.add` does."""
-        self._put(shot)
-
-    def refuse(self, refused: RefusedFrame) -> None:
-        """Have a refused frame kept apart. Raises as `BundleWriter.refuse` does."""
-        self._put(refused)
+    def add(self, item: Shot | RefusedFrame) -> None:
+        """Have a frame written, a refused one apart; waits while too many are waiting already. Raises as
+        `BundleWriter.add` and `BundleWriter.refuse` do.
+        """
+        if self._error is not None:
+            raise self._error
+        if self._thread is None:
+            shot = item if isinstance(item, Shot) else item.shot
+            size = _LEAST_FRAME_BYTES if shot is None else max(shot.image.nbytes, _LEAST_FRAME_BYTES)
+            self._waiting = queue.Queue(max(1, self._most_bytes // size))
+            self._thread = threading.Thread(target=self._write, name="slrig-recorder", daemon=True)
+            self._thread.start()
+        self._waiting.put(item)
 
     def finish(self) -> None:
         """Wait until everything is written. Idempotent. Raises what the writer raised."""
@@ -389,17 +396,6 @@ class Recorder:
             self._waiting.put(None)
             self._thread.join()
 
-    def _put(self, item: Shot | RefusedFrame) -> None:
-        if self._error is not None:
-            raise self._error
-        if self._thread is None:
-            shot = item if isinstance(item, Shot) else item.shot
-            size = _LEAST_FRAME_BYTES if shot is None else max(shot.image.nbytes, _LEAST_FRAME_BYTES)
-            self._waiting = queue.Queue(max(1, self._most_bytes // size))
-            self._thread = threading.Thread(target=self._write, name="slrig-recorder", daemon=True)
-            self._thread.start()
-        self._waiting.put(item)
-
     def _write(self) -> None:
         while (item := self._waiting.get()) is not None:
             if self._stopped:
@@ -418,9 +414,8 @@ def capture_frames(
     rig: Rig,
     plan: ScanPlan,
     folder: Path,
+    listener: Listener = SILENT,
     *,
-    progress: ProgressCallback,
-    cancelled: Callable[[], bool],
     frames: FrameSink | None = None,
     health: Mapping[str, Any] | None = None,
 ) -> Recording:
@@ -442,7 +437,7 @@ def capture_frames(
     DeviceError
         The rig failed, or has no turntable, colour or coloured light where the plan asks for it.
     ScanCancelledError
-        `cancelled()` became true.
+        The listener had it cancelled.
     StorageError
         The disk refused. In these cases nothing is left in `folder`. In every case the projector is dark.
     """
@@ -451,17 +446,17 @@ def capture_frames(
     told += _of_the_rig(rig)
     for words in told:
         _log.info(words, rig=rig.name)
-        progress("capture", 0.0, words)
+        listener.report("capture", 0.0, words)
     formats = {name: camera.info.format for name, camera in rig.cameras.items()}
     colour = in_colour(plan, {name: camera.info for name, camera in rig.cameras.items()}, rig.projector.info)
-    turntable = _turned(rig, plan, progress)
+    turntable = _turned(rig, plan, listener)
     writer = BundleWriter(
         folder, rig.projector.info.size, sequence.patterns, formats, rig.calibration, captured_at=datetime.now(UTC)
     )
     with ExitStack() as writing:
         writing.enter_context(writer)
         recorder = writing.enter_context(Recorder(writer))
-        exposing = Exposing(rig, sequence, exposures_s, cancelled=cancelled, refused=recorder.refuse, colour=colour)
+        exposing = Exposing(rig, sequence, exposures_s, listener, recorder, colour=colour)
         if frames is not None:
             once = tuple((index, name) for index in range(len(sequence)) for name in formats)
             listed = once * max(len(exposures_s), 1)
@@ -471,7 +466,7 @@ def capture_frames(
                 if frames is not None:
                     frames.take(shot)
                 recorder.add(shot)
-                progress("capture", exposing.done / exposing.total, _detail(exposing))
+                listener.report("capture", exposing.done / exposing.total, _detail(exposing))
         except (ScanEvidenceError, FrameTimeoutError) as error:
             recorder.finish()
             writer.keep(str(error))
@@ -487,7 +482,7 @@ def capture_frames(
         return Recording(folder, writing.pop_all(), told, rig.truth(), turntable, health)
 
 
-def _turned(rig: Rig, plan: ScanPlan, progress: ProgressCallback) -> TurntableAngle | None:
+def _turned(rig: Rig, plan: ScanPlan, listener: Listener) -> TurntableAngle | None:
     """Turn the object as planned; return the turntable's angle, None if the plan has none."""
     if plan.turn_deg is None:
         return None
@@ -495,7 +490,7 @@ def _turned(rig: Rig, plan: ScanPlan, progress: ProgressCallback) -> TurntableAn
     if plan.turned_by == "table":
         if not isinstance(rig.positioner, Turntable):
             raise no_turntable(plan.turn_deg)
-        progress("turn", 0.0, f"to {plan.turn_deg:g}°")
+        listener.report("turn", 0.0, f"to {plan.turn_deg:g}°")
         rig.positioner.turn(plan.turn_deg)
         count = rig.positioner.count if isinstance(rig.positioner, CountedTurntable) else None
     return TurntableAngle(angle_deg=plan.turn_deg, turned_by=plan.turned_by, count=count)

@@ -34,7 +34,6 @@ from slrig.reconstruction import CONVERGED, distorted_from_pixel, optical_depths
 from slrig.ros_messages import POINT_FIELDS, point_table
 from slrig.scan.artefacts import MESH, REPORT, decode_mesh_ply
 from slrig.scan.formats import causes_picture
-from slrig.scan.plan import ProgressCallback
 
 _NO_SURFACE = Refusal.NO_SURFACE.name.lower()
 _MOST_BANDS = 4  # each has a picture of its own, which is 12 bytes a pixel
@@ -330,9 +329,6 @@ def encode_pcd(cloud: OrganisedCloud) -> bytes:
     return "\n".join(header).encode("ascii") + b"\n" + point_table(cloud).tobytes()
 
 
-STAGE = "organise points"
-
-
 ENCODERS: Mapping[str, Callable[[OrganisedCloud], bytes]] = {
     "points-{camera}.npz": encode_npz,
     "points-{camera}.pcd": encode_pcd,
@@ -347,7 +343,6 @@ def cloud_file(
     *,
     bundle: Path | None = None,
     calibration: Path | None = None,
-    progress: ProgressCallback = lambda *_: None,
 ) -> bytes:
     """Make a file of a finished scan. form : of `slrig.scan.formats.requested_forms`. camera : None for a file of all.
     bundle : None for that of the scan. calibration : the one that the mesh was made with, None for that in the bundle.
@@ -363,7 +358,6 @@ def cloud_file(
     StorageError
         A file of the scan cannot be read.
     """
-    progress(STAGE, 0.0, "")
     bundle = bundle or folder / BUNDLE
     calibration = calibration or bundle / CALIBRATION
     encode: Callable[..., bytes] = ENCODERS.get(form) or next(each.encode for each in formats() if each.name == form)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from statistics import geometric_mean, median
@@ -24,6 +24,7 @@ from slrig.capture import (
 )
 from slrig.devices import CameraSettings, Rig
 from slrig.errors import ConfigError, RigBusyError, UnsupportedByDeviceError
+from slrig.jobs.listener import SILENT, Listener
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import Holder
 from slrig.model import Black, NoiseModel, Shot, White, fit_noise
@@ -288,9 +289,9 @@ class _Unjudged(Evidence):
 class Looking:
     """Looks through all cameras of an open rig. overheads_s : what a frame takes beside its exposure, of each look."""
 
-    def __init__(self, rig: Rig, *, cancelled: Callable[[], bool]) -> None:
+    def __init__(self, rig: Rig, listener: Listener = SILENT) -> None:
         self._rig = rig
-        self._cancelled = cancelled
+        self._listener = listener
         self._samplers = {name: Sampler.from_size(camera.info.format.size) for name, camera in rig.cameras.items()}
         self._looks: dict[float, Mapping[str, Look]] = {}
         self._refused_shorter = False
@@ -350,7 +351,10 @@ class Looking:
         shots = {
             (shot.pattern, shot.camera): shot
             for shot in capture(
-                replace(rig, settings=settings), encode(_PATTERNS, size), cancelled=self._cancelled, evidence=unjudged
+                replace(rig, settings=settings),
+                encode(_PATTERNS, size),
+                cancelled=self._listener.cancelled,
+                evidence=unjudged,
             )
         }
         taken = {}
@@ -392,10 +396,10 @@ def proposed_exposures(manager: JobManager, plan: ScanPlan, *, budget_s: float |
         As a scan does.
     """
 
-    def look(held: RigSession, cancelled: Callable[[], bool]) -> tuple[Looking, int]:
+    def look(held: RigSession, listener: Listener) -> tuple[Looking, int]:
         rig = held.open()
         frames = len(rig_sequence(plan, rig))
-        looking = Looking(rig, cancelled=cancelled)
+        looking = Looking(rig, listener)
         looking.look()
         return looking, frames
 

@@ -136,10 +136,7 @@ class ScanJob(Job):
 
     def capture(self, rig: RigSession, run: JobRun) -> Recording:
         """Record a bundle, and show its frames to the worker meanwhile."""
-        return capture_frames(
-            rig.open(), self.plan, run.recording,
-            progress=run.report, cancelled=run.cancelled, frames=run.frames, health=rig.health(),
-        )  # fmt: skip
+        return capture_frames(rig.open(), self.plan, run.recording, run, frames=run.frames, health=rig.health())
 
     def compute(self, run: JobRun) -> Outcome:
         """Reconstruct the bundle."""
@@ -147,8 +144,8 @@ class ScanJob(Job):
             shutil.rmtree(run.result, ignore_errors=True)
             run.result.mkdir()
         report = run.pipeline.reconstruct_into(
-            run.bundle, run.result, plan=self.plan.reconstruction, progress=run.report, cancelled=run.cancelled,
-            made=run.file_ready, live=run.live, judged=run.evidence, where=run.where,
+            run.bundle, run.result, run, plan=self.plan.reconstruction, live=run.live, judged=run.evidence,
+            where=run.where,
         )  # fmt: skip
         return Outcome(report_summary(report))
 

@@ -12,7 +12,6 @@ from datetime import datetime, timedelta
 from enum import StrEnum
 from math import asin, degrees
 from pathlib import Path
-from typing import Protocol
 from uuid import UUID
 
 from slrig.bundle import (
@@ -57,14 +56,6 @@ _OF_SINES = ("sine_period_px", "sine_steps")
 
 MOST_TURN_DEG = 3600.0
 """Ten turns either way: more is a slip, and winds up the cables of what stands on a turntable."""
-
-
-class ProgressCallback(Protocol):
-    """Told how far a scan is: the stage, the fraction done (0 to 1) of the whole call, and a few words."""
-
-    def __call__(self, stage: str, fraction: float, detail: str, /) -> None:
-        """Take note."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

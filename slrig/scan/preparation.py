@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from slrig.bundle import BundleFiles, write_bundle
 from slrig.capture import EvidenceSummary, FrameLight, describe_indices
 from slrig.errors import StorageError
+from slrig.jobs.listener import Listener
 from slrig.kernels import KernelCount, count_prepared, rare_garbage_collection, report_compilations
 from slrig.meshing import FIRST_STAGE
 from slrig.model import (
@@ -308,10 +309,7 @@ def prepare_kernels(reconstruct: Callable[..., Any], told: Callable[[KernelCount
             with report_compilations(compiling), TemporaryDirectory(prefix="slrig-") as folder:
                 bundle = Path(folder, "bundle")
                 write_bundle(bundle, *sample_scan())
-                reconstruct(
-                    bundle, Path(folder, "result"), plan=ReconstructionPlan(), progress=entered,
-                    cancelled=lambda: False,
-                )  # fmt: skip
+                reconstruct(bundle, Path(folder, "result"), Listener(report=entered), plan=ReconstructionPlan())
         except (OSError, StorageError) as error:
             # A full disk is told by the scan that meets it; kernels are then compiled while it waits.
             _log.warning("kernels could not be prepared", cause=str(error))

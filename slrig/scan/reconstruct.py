@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from slrig.bundle import read_capture, read_health, read_notes, read_truth, read_turntable_angle, write_file
 from slrig.capture import EvidenceSummary
 from slrig.disk import storage_errors
-from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, ScanCancelledError, setting
+from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, setting
 from slrig.jobs.database import computed
+from slrig.jobs.listener import SILENT, Listener
 from slrig.kernels import KernelCount, report_compilations, trim_malloc
 from slrig.meshing import (
     MeshingLimits,
@@ -118,7 +119,7 @@ from slrig.scan.pictures import (
     rejection_picture,
     rejection_size,
 )
-from slrig.scan.plan import ProgressCallback, ReconstructionPlan
+from slrig.scan.plan import ReconstructionPlan
 from slrig.scan.preparation import prepare_kernels
 from slrig.scan.report import (
     Stopwatch,
@@ -203,11 +204,10 @@ class _Meshed:
 def reconstruct_bundle(
     bundle: Path,
     output: Path,
+    listener: Listener = SILENT,
     *,
     plan: ReconstructionPlan,
     calibration: Path | None = None,
-    progress: ProgressCallback,
-    cancelled: Callable[[], bool],
     live: LiveScan | None = None,
 ) -> dict[str, object]:
     """Reconstruct a recorded bundle into `output`, as `reconstruct_into` does, and return the report. `output` appears
@@ -221,20 +221,16 @@ def reconstruct_bundle(
         See `reconstruct_into`.
     """
     with staged_folder(output) as staging:
-        return reconstruct_into(
-            bundle, staging, plan=plan, calibration=calibration, progress=progress, cancelled=cancelled, live=live
-        )
+        return reconstruct_into(bundle, staging, listener, plan=plan, calibration=calibration, live=live)
 
 
 def reconstruct_into(
     bundle: Path,
     folder: Path,
+    listener: Listener = SILENT,
     *,
     plan: ReconstructionPlan,
     calibration: Path | None = None,
-    progress: ProgressCallback,
-    cancelled: Callable[[], bool],
-    made: Callable[[str], None] = lambda _: None,
     where: Mapping[str, str] | None = None,
     live: LiveScan | None = None,
     judged: EvidenceSummary | None = None,
@@ -246,8 +242,8 @@ def reconstruct_into(
     where : `slrig.jobs.worker.Task.where`, for the report.
 
     Writes mesh.ply first, then mesh.glb and points.ply, then preview.png, two pictures of the refused pixels
-    per camera, and report.json. Each file appears whole, and `made` is told its name; whoever keeps the folder has to
-    bring it to disk.
+    per camera, and report.json. Each file appears whole, and the listener is told its name; whoever keeps the folder
+    has to bring it to disk.
 
     Raises
     ------
@@ -256,7 +252,7 @@ def reconstruct_into(
     NothingToReconstructError
         The frames hold no surface.
     ScanCancelledError
-        `cancelled()` became true.
+        The listener had it cancelled.
     StorageError
         The disk refused.
     """
@@ -266,23 +262,21 @@ def reconstruct_into(
 
     def entered(stage: str, fraction: float, detail: str) -> None:
         nonlocal at
-        if cancelled():
-            message = f"the scan was cancelled before '{stage}'"
-            raise ScanCancelledError(message)
+        listener.check(f"the scan was cancelled before '{stage}'")
         watch.enter(stage)
         # Frames are read and checked one after another while those before them are decoded: that is no step back.
         if (stage, fraction, detail) != at and not (at[0] and stage in _BETWEEN):
             at = (stage, fraction, detail)
             trim_malloc()
-            progress(stage, fraction, detail)
+            listener.report(stage, fraction, detail)
 
     def compiling(kernel: str) -> None:
         # What only some scans need is compiled when the first one comes.
-        progress(*at[:2], f"preparing kernels, first time only: {kernel}")
+        listener.report(*at[:2], f"preparing kernels, first time only: {kernel}")
 
     def place(name: str, data: bytes | bytearray) -> None:
         write_file(folder / name, data, durable=False)
-        made(name)
+        listener.file_ready(name)
 
     with report_compilations(compiling), ThreadPoolExecutor(1, thread_name_prefix="slrig-pictures") as beside:
         entered("read bundle", 0.0, str(bundle))
@@ -344,7 +338,7 @@ def reconstruct_into(
             "stages_s": seconds,
         }
         place(REPORT, encode_report(report))
-    progress("done", 1.0, f"{len(mesh.faces)} triangles")
+    listener.report("done", 1.0, f"{len(mesh.faces)} triangles")
     return report
 
 

@@ -628,7 +628,7 @@ class Tasks:
         try:
             if self._manager.rig.facts is None:
                 # What it can do is known only when it is open.
-                self._manager.lend(holder, lambda rig, _cancelled: rig.open())
+                self._manager.lend(holder, lambda rig, _listener: rig.open())
             return task.do(holder, checked(task.options, order.options, task=order.task), stop=stop)
         finally:
             with self._lock:

@@ -93,7 +93,7 @@ def scanned(rig: Rig, plan: ScanPlan, name: str) -> Row:
     with TemporaryDirectory() as folder:
         bundle, began_ns = Path(folder, "bundle"), rig.clock.now_ns()
         try:
-            capture_frames(rig, plan, bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
+            capture_frames(rig, plan, bundle).finish()
             seconds = (rig.clock.now_ns() - began_ns) / 1e9
             report: Mapping[str, Any] = reconstructed(bundle, Path(folder, "result"))
         except (ScanEvidenceError, NothingToReconstructError):
@@ -128,7 +128,7 @@ def by_preset(rig: Rig, name: str) -> Row:
 
 def proposed(rig: Rig, budget_s: float | None = None) -> Proposal:
     """What the assistant proposes for a scan by the usual patterns."""
-    looking = Looking(rig, cancelled=lambda: False)
+    looking = Looking(rig)
     looking.look()
     frames = len(pattern_sequence(PatternPlan(), rig.projector.info.size, rig.calibration, rig.cameras))
     overhead_s = median(looking.overheads_s)

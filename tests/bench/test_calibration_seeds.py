@@ -92,7 +92,7 @@ def solved(
             rig.positioner.move(index)
             bundle = folder / name
             try:
-                capture_frames(rig, plan, bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
+                capture_frames(rig, plan, bundle).finish()
                 spoil(bundle)
                 seen.append(read_pose(bundle, board, name).observation)
             except (PoseRefusedError, ScanEvidenceError) as error:

@@ -79,7 +79,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     folder = tmp_path_factory.mktemp("speed")
     (folder / "rig.toml").write_text(RIG)
     with open_rig(read_rig(folder / "rig.toml")) as rig:
-        capture_frames(rig, ScanPlan(), folder / "bundle", progress=lambda *_: None, cancelled=lambda: False).finish()
+        capture_frames(rig, ScanPlan(), folder / "bundle").finish()
     return read_bundle(folder / "bundle")
 
 

@@ -55,7 +55,7 @@ def rendered(folder: Path, text: str, plan: ScanPlan) -> Path:
     folder.mkdir(parents=True)
     (folder / "rig.toml").write_text(text.replace("samples_per_axis = 2", "samples_per_axis = 1"))
     with open_rig(read_rig(folder / "rig.toml")) as rig:
-        capture_frames(rig, plan, folder / "bundle", progress=lambda *_: None, cancelled=lambda: False).finish()
+        capture_frames(rig, plan, folder / "bundle").finish()
     for truth in (*(folder / "bundle").glob("truth*"), folder / "bundle" / "visible_points.npy"):
         truth.unlink()
     return folder / "bundle"

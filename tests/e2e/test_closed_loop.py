@@ -353,8 +353,8 @@ def scanned_here(rig: Rig, folder: Path) -> Mesh:
     """Scan in this process."""
     bundle, results = folder / "bundle", folder / "results"
     with rig:
-        capture_frames(rig, ScanPlan(), bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
-    reconstruct_bundle(bundle, results, plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(rig, ScanPlan(), bundle).finish()
+    reconstruct_bundle(bundle, results, plan=ReconstructionPlan())
     return mesh_in(results)
 
 

@@ -271,7 +271,7 @@ class Recorded:
         self.folder = folder / "own"
         with open_rig(read_rig(rig)) as opened:
             plan = ScanPlan()
-            capture_frames(opened, plan, self.folder, progress=lambda *_: None, cancelled=lambda: False).finish()
+            capture_frames(opened, plan, self.folder).finish()
         bundle = read_bundle(self.folder)
         assert bundle.calibration is not None
         self.capture, self.calibration = bundle.capture, bundle.calibration

@@ -38,12 +38,12 @@ MATHEMATICS = ("numba", "llvmlite", "scipy/optimize", "scipy/linalg", "scipy/spa
 
 
 def recorded(rig: Rig, bundle: Path, plan: ScanPlan) -> Path:
-    capture_frames(rig, plan, bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
+    capture_frames(rig, plan, bundle).finish()
     return bundle
 
 
 def meshes(bundle: Path, output: Path) -> dict[str, bytes]:
-    reconstruct_bundle(bundle, output, plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False)
+    reconstruct_bundle(bundle, output, plan=ReconstructionPlan())
     return written(output)
 
 

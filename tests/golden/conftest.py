@@ -41,7 +41,7 @@ def scan_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scan]:
         with FileLock(root / f"golden-{name}.lock"):
             if not (output / "report.json").exists():
                 with open_rig(read_rig(RIGS / f"{name}.toml")) as rig:
-                    taken = capture_frames(rig, ScanPlan(), bundle, progress=lambda *_: None, cancelled=lambda: False)
+                    taken = capture_frames(rig, ScanPlan(), bundle)
                     taken.finish()
                 reconstructed(bundle, output)
         return Scan(bundle, output, json.loads((output / "report.json").read_text()))

@@ -62,7 +62,7 @@ def outcome(
     config = scripted_config(read_rig(RIG), plan, folder / "scene")
     with local.local_manager(config, PositionJob) as manager:
         manager.lend(Holder("test", "test", None), lambda rig, _: rig.open())
-        return measure_positions(manager, wrong or plan, folder / "out", progress=lambda *_: None)
+        return measure_positions(manager, wrong or plan, folder / "out")
 
 
 def scaled(calibration: Calibration, scale: float) -> Calibration:

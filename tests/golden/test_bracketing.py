@@ -48,9 +48,7 @@ class Watching:
 
 def captured(rig: Path, plan: ScanPlan, bundle: Path, watching: Watching | None = None) -> Path:
     with open_rig(read_rig(rig)) as opened:
-        capture_frames(
-            opened, plan, bundle, progress=lambda *_: None, cancelled=lambda: False, frames=watching
-        ).finish()  # fmt: skip
+        capture_frames(opened, plan, bundle, frames=watching).finish()
     return bundle
 
 

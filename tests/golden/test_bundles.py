@@ -22,9 +22,7 @@ SCENES = tuple(GOALS)
 
 def reconstructed(bundle: Path, output: Path, plan: ReconstructionPlan | None = None, **options: Any) -> Any:
     """Reconstruct a bundle as the service does; the report."""
-    return reconstruct_bundle(
-        bundle, output, plan=plan or ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False, **options
-    )
+    return reconstruct_bundle(bundle, output, plan=plan or ReconstructionPlan(), **options)
 
 
 @pytest.mark.parametrize("scene", [pytest.param(each, marks=[pytest.mark.slow] * (each != "vase")) for each in SCENES])

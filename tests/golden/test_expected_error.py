@@ -117,7 +117,7 @@ def rig_file(folder: Path, scene: str, seed: int, poses: str = "") -> Path:
 def captured(folder: Path, scene: str, seed: int, bundle: Path) -> Calibration:
     """Capture one thing; the rig's exact calibration, in its own world."""
     with open_rig(read_rig(rig_file(folder, scene, seed))) as rig:
-        capture_frames(rig, ScanPlan(), bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
+        capture_frames(rig, ScanPlan(), bundle).finish()
         # What is compared with the truth here is compared below.
         for path in (*bundle.glob("truth*"), bundle / "visible_points.npy"):
             path.unlink()
@@ -134,7 +134,7 @@ def observed(folder: Path, seed: int) -> Observations:
         for index, name in enumerate(rig.positioner.poses):
             rig.positioner.move(index)
             bundle = folder / f"pose_{index:02d}"
-            capture_frames(rig, plan, bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
+            capture_frames(rig, plan, bundle).finish()
             seen.append(read_pose(bundle, BOARD, name).observation)
         sizes = {name: camera.info.format.size for name, camera in rig.cameras.items()}
         return Observations(BOARD, sizes, rig.projector.info.size, tuple(seen))

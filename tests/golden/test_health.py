@@ -104,7 +104,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
         assert rig.positioner is not None
         rig.positioner.move(POSE)
         plan = ScanPlan(patterns=PatternPlan(rows=True))
-        capture_frames(rig, plan, folder / "pose", progress=lambda *_: None, cancelled=lambda: False).finish()
+        capture_frames(rig, plan, folder / "pose").finish()
     return read_bundle(folder / "pose")
 
 

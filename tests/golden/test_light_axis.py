@@ -98,10 +98,7 @@ def scanned(rig: Path, *, plan: PatternPlan | None = None, projector_known: bool
     with open_rig(read_rig(rig)) as opened:
         assert opened.calibration is not None
         known = opened.calibration if projector_known else Calibration(opened.calibration.cameras, None)
-        capture_frames(
-            replace(opened, calibration=known), ScanPlan(patterns=plan or PatternPlan()), bundle,
-            progress=lambda *_: None, cancelled=lambda: False,
-        ).finish()  # fmt: skip
+        capture_frames(replace(opened, calibration=known), ScanPlan(patterns=plan or PatternPlan()), bundle).finish()
     report: Mapping[str, Any] = reconstructed(bundle, rig.parent / "out")
     return report
 

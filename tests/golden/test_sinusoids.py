@@ -41,9 +41,7 @@ def test_sinusoids_measure_a_rendered_ball(
     rig_file = BUNDLES["ball with its truth"].rig_file(tmp_path)
     monkeypatch.setattr(acquisition, "rig_sequence", lambda _plan, rig: encode(patterns, rig.projector.info.size))
     with open_rig(read_rig(rig_file)) as rig:
-        acquisition.capture_frames(
-            rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False
-        ).finish()
+        acquisition.capture_frames(rig, ScanPlan(), tmp_path / "bundle").finish()
     report = reconstructed(tmp_path / "bundle", tmp_path / "mesh")
     assert report["method"] == method
     assert any("to the power of 1." in str(note) for note in report["notes"])

@@ -20,6 +20,7 @@ from slrig.cli import local
 from slrig.cli.commands import app
 from slrig.config import read_rig
 from slrig.devices import CameraSettings, Rig, Turntable
+from slrig.jobs.listener import SILENT
 from slrig.model import MeasuredAxis, PlaneKind, RotationAxis
 from slrig.model_jobs.combining import read_mesh
 from slrig.multiview.registration import register_views
@@ -48,7 +49,7 @@ def recorded(rig: Rig, angle_deg: float, bundle: Path, *, rows: bool) -> Path:
     assert isinstance(rig.positioner, Turntable)
     rig.positioner.turn(angle_deg)
     plan = ScanPlan(patterns=PatternPlan(rows=rows))
-    capture_frames(rig, plan, bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
+    capture_frames(rig, plan, bundle).finish()
     return bundle
 
 
@@ -80,7 +81,7 @@ def test_the_axis_is_found_from_a_board_at_six_angles(tmp_path: Path, monkeypatc
     with board_rig(head, options) as rig:
         monkeypatch.setattr(local, "open_rig", lambda _config: rig)
         board = Board(BoardKind.CHARUCO, 6, 4, 26.0, 20.0, "DICT_4X4_50")
-        record = local.run_job(read_rig(CONFIG / "rigs" / "plane.toml"), AxisJob(board), lambda *_: None)
+        record = local.run_job(read_rig(CONFIG / "rigs" / "plane.toml"), AxisJob(board), SILENT)
     shot = (record.summary or {})["axis"]
     again = MeasuredAxis(*(np.array(shot[name]) for name in ("point_mm", "direction", "covariance")))
     is_the_axis(again, axis)

@@ -49,6 +49,7 @@ from slrig.config import read_rig
 from slrig.devices import Rig
 from slrig.discovery import open_rig
 from slrig.errors import InvalidInputError, ScanCancelledError, ServiceError, SlrigError, UnsupportedByDeviceError
+from slrig.jobs.listener import SILENT, Listener
 from slrig.jobs.manager import JobManager
 from slrig.model import Region
 from slrig.scan.formats import MEDIA_TYPES
@@ -71,10 +72,6 @@ SERIES = "/scan/series/9"
 def printed(code: str) -> str:
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603
     return found.stdout.strip().splitlines()[-1]
-
-
-def ignore(_stage: str, _fraction: float, _detail: str) -> None:
-    return
 
 
 def commands() -> list[tuple[str, ...]]:
@@ -242,7 +239,7 @@ def scan_of(name: str, *, rig: str = "sphere", label: str = "demo") -> dict[str,
 def requests(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     sent: list[dict[str, Any]] = []
 
-    def scanned(_client: Client, request: dict[str, Any], _output: Path, **_: object) -> dict[str, Any]:
+    def scanned(_client: Client, request: dict[str, Any], *_: object, **__: object) -> dict[str, Any]:
         sent.append(request)
         return SCAN
 
@@ -308,9 +305,9 @@ def test_scan_is_followed_and_fetched_or_says_which_files_it_has(tmp_path: Path)
         shown.append((stage, fraction))
 
     with client_of(Walk(mesh_ply=b"ply")) as client:
-        scan_with(client, {}, tmp_path / "out", files=("mesh.ply",), display=display)
+        scan_with(client, {}, tmp_path / "out", Listener(report=display), files=("mesh.ply",))
         with pytest.raises(ServiceError, match=r"no mesh\.obj\. It has: mesh\.ply"):
-            scan_with(client, {}, tmp_path / "none", files=("mesh.ply", "mesh.obj"), display=ignore)
+            scan_with(client, {}, tmp_path / "none", SILENT, files=("mesh.ply", "mesh.obj"))
     assert not (tmp_path / "none").exists()
     assert (tmp_path / "out" / "mesh.ply").read_bytes() == b"ply"
     assert shown == [("waiting for the rig", 0.0), ("capture", 0.25), ("fetching mesh.ply", 1.0), ("done", 1.0)]
@@ -391,7 +388,7 @@ def test_series_goes_on_after_a_failure_and_names_it(tmp_path: Path, capsys: pyt
     request = {"repeat": 3, "every_s": 2.0}
     assert ScanRequest.model_validate(request).repeat == 3
     with client_of(answer) as client, pytest.raises(ServiceError, match=r"^1 of 3 scans did not succeed: 002\.$"):
-        series_with(client, request, tmp_path, files=("mesh.ply",), display=ignore)
+        series_with(client, request, tmp_path, SILENT, files=("mesh.ply",))
     assert sent == [request]
     assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.ply")) == [
         "001/mesh.ply",
@@ -420,7 +417,7 @@ def test_ctrl_c_cancels_the_scan_or_the_whole_series(
     monkeypatch.setattr(ScanJob, "result", interrupted)
     scan = series_with if series else scan_with
     with client_of(answer) as client, pytest.raises(KeyboardInterrupt):
-        scan(client, {"repeat": 2 if series else 1}, tmp_path, display=ignore)
+        scan(client, {"repeat": 2 if series else 1}, tmp_path, SILENT)
     assert posted == ["/scan", f"{SERIES if series else SCAN['links']['self']}/cancel"]
 
 
@@ -452,7 +449,7 @@ def test_name_that_no_scan_has_is_refused_before_one_is_shot(
         return httpx2.Response(409, json={"detail": "the rig is held"})
 
     with client_of(handler) as client, pytest.raises(SlrigError, match=told or "the rig is held"):
-        scan_with(client, {}, tmp_path / "out", files=("mesh.ply", name), display=ignore)
+        scan_with(client, {}, tmp_path / "out", SILENT, files=("mesh.ply", name))
     assert (len(started) == 0) == (told is not None)
 
 
@@ -596,10 +593,12 @@ def test_the_command_does_the_test_and_returns_the_decision(
 ) -> None:
     whole, limits_mm = measure_positions, list[float]()
 
-    def shortened(manager: JobManager, plan: AcceptancePlan, folder: Path, **options: Any) -> AcceptanceResult:
+    def shortened(
+        manager: JobManager, plan: AcceptancePlan, folder: Path, listener: Listener = SILENT, **options: Any
+    ) -> AcceptanceResult:
         limits_mm.append(plan.limits.spacing_mm)
         steps = tuple(step for step in plan.steps if step.name == "bar-5")
-        return whole(manager, replace(plan, steps=steps, repeats=1), folder, **options)
+        return whole(manager, replace(plan, steps=steps, repeats=1), folder, listener, **options)
 
     monkeypatch.setattr(accepting, "measure_positions", shortened)
     output, rig_file = tmp_path / "out", tmp_path / "rig.toml"

@@ -23,6 +23,7 @@ from slrig.cli.commands import INTERRUPTED
 from slrig.cli.options import ServiceOptions
 from slrig.client import Client
 from slrig.errors import PoseRefusedError, SolveRefusedError
+from slrig.jobs.listener import Listener
 from tests.unit import command
 from tests.unit.calibrate.solved import BOARD, BUMP, BUMPED, POSES, read_poses, solved_result
 from tests.unit.calibrate_command import refused, run
@@ -78,12 +79,14 @@ class Solving:
             raise found
         return found
 
-    def solve_poses(self, board: object, cameras: object, projector: object, given: Any, **options: Any) -> object:
+    def solve_poses(
+        self, board: object, cameras: object, projector: object, given: Any, listener: Listener, /, **options: Any
+    ) -> object:
         if self.refusal is not None:
             raise self.refusal
         names = [each.observation.name for each in given]
         self.asked = {"board": board, "cameras": cameras, "projector": projector, "poses": names, **options}
-        options["progress"]("adjustment", 0.5, "")
+        listener.report("adjustment", 0.5, "")
         return solved_result()
 
 

@@ -17,6 +17,7 @@ from typer.testing import Result
 from slrig.bundle import write_bundle
 from slrig.cli.commands import INTERRUPTED
 from slrig.errors import NothingToReconstructError
+from slrig.jobs.listener import Listener
 from slrig.scan.artefacts import staged_folder
 from slrig.scan.preparation import sample_scan
 from tests.unit.command import slrig
@@ -41,17 +42,17 @@ class Reconstruction:
         self.prepared += 1
         return 0
 
-    def __call__(self, bundle: Path, output: Path, *, progress: Callable[..., None], **_: object) -> Report:
+    def __call__(self, bundle: Path, output: Path, listener: Listener, **_: object) -> Report:
         if self.counts_kept:
             gc.collect()
             self.kept.append(sum(each() is not None for each in self._reports))
         self.seen.append(bundle.name)
         with staged_folder(output) as staging:
             (staging / "mesh.ply").write_text(bundle.name)
-            progress("decode", 0.5, "")
+            listener.report("decode", 0.5, "")
             self.wanted.get(bundle.name, lambda: None)()
             (staging / "report.json").write_text('{"format": "slrig-report"}')
-        progress("done", 1.0, "")
+        listener.report("done", 1.0, "")
         mesh = {
             "figures": {"triangles": 1234, "vertices": 617},
             "sigma_mm": {"p50": 0.0123},

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -32,13 +32,13 @@ def rig_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             raise ServiceError(message)
         return {"rig": "bench", "found": f"{kind} {Path.home()}/rig.toml"}, None
 
-    def scanned(_client: Client, _request: object, output: Path, *, files: tuple[str, ...], **_: object) -> None:
+    def scanned(_client: Client, _request: object, output: Path, _part: object, *, files: tuple[str, ...]) -> None:
         output.mkdir()
         for name in files:
             (output / name).write_text(name)
 
     @contextmanager
-    def serving(_rig: Path, data: Path, _told: Callable[[str, float, str], None]) -> Iterator[Client]:
+    def serving(_rig: Path, data: Path, _told: object) -> Iterator[Client]:
         (data / "service.log").write_text(f"the key is {KEY}")
         with client_of(lambda _: httpx2.Response(200, json={"name": "bench"})) as client:
             yield client

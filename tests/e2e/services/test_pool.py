@@ -21,6 +21,7 @@ from urllib.parse import urlsplit
 import httpx2
 import pytest
 
+from slrig.jobs.listener import Listener
 from slrig.jobs.worker import Compute, Worker
 from slrig.scan.job import PIPELINE
 from tests.e2e.conftest import Start, write_rig
@@ -217,7 +218,7 @@ class Rig:
                 begun = True
                 when_begun()
 
-        self.worker.run(reconstruction(result), progress=progress)
+        self.worker.run(reconstruction(result), Listener(report=progress))
         assert begun
         report = json.loads((result / "result" / "report.json").read_text())
         section: dict[str, Any] = report["computed"]

@@ -171,9 +171,9 @@ def test_script_that_is_cancelled_while_a_position_is_measured_ends_with_it(
     test = desk.open(the_plan)
     evaluated = acceptance.evaluated
 
-    def cancelled_meanwhile(*given: Any, **options: Any) -> Reading:
+    def cancelled_meanwhile(*given: Any) -> Reading:
         desk.cancel(test.id)
-        return evaluated(*given, **options)
+        return evaluated(*given)
 
     monkeypatch.setattr(acceptance, "evaluated", cancelled_meanwhile)
     desk.measure(test.id, wait=False, scripted=True)
@@ -186,9 +186,9 @@ def test_next_position_is_put_on_record_once(desk: Desk, monkeypatch: pytest.Mon
     test = desk.open(the_plan)
     evaluated = acceptance.evaluated
 
-    def killed_afterwards(*given: Any, **options: Any) -> Reading:
+    def killed_afterwards(*given: Any) -> Reading:
         desk.manager.lazy = True
-        return evaluated(*given, **options)
+        return evaluated(*given)
 
     monkeypatch.setattr(acceptance, "evaluated", killed_afterwards)
     AcceptanceTests.measure(desk, test.id, wait=False, scripted=True)

@@ -195,7 +195,7 @@ def test_a_noisier_scanner_meets_the_same_limit_and_the_same_uncertainty(artefac
     assert noisy[0].decision is Decision.FAILS
 
 
-def nothing_captured(rig: Rig, _plan: object, folder: Path, **_: object) -> TameRecording:
+def nothing_captured(rig: Rig, _plan: object, folder: Path, _listener: object) -> TameRecording:
     """In place of a capture."""
     assert rig.truth() is None
     folder.mkdir()
@@ -208,7 +208,7 @@ Scan = Callable[[Step], Mesh]
 def take_scans_from(monkeypatch: pytest.MonkeyPatch, plan: AcceptancePlan, scan: Scan = scan_of) -> None:
     """Have every capture of a plan's step be reconstructed as `scan` says."""
 
-    def reconstruct(bundle: Path, output: Path, /, **_: object) -> Mapping[str, Any]:
+    def reconstruct(bundle: Path, output: Path, _listener: object, /, **_: object) -> Mapping[str, Any]:
         name = bundle.name.rsplit("-", 1)[0]
         output.mkdir()
         step = next(step for step in plan.steps if step.name == name)
@@ -241,7 +241,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Accept
         manager.cancelled = cancelled
         try:
             stated = replace(plan, rendered=False)
-            return measure_positions(manager, stated, tmp_path / "out", progress=lambda *_: None, **asked)
+            return measure_positions(manager, stated, tmp_path / "out", **asked)
         finally:
             database.close()
             folder.release()

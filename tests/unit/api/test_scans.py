@@ -32,6 +32,7 @@ from slrig.devices import Rig
 from slrig.errors import WorkerLostError
 from slrig.jobs import data_folder
 from slrig.jobs.data_folder import DataFolder, damaged_files, write_entries
+from slrig.jobs.listener import Listener
 from slrig.jobs.records import JobState, acting_as, read_record
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Task
@@ -559,8 +560,8 @@ class FaultyBench(ServedBench):
     def open_rig(self) -> Rig:
         return self.rig
 
-    def capture(self, rig: Rig, _plan: ScanPlan, folder: Path, /, **options: Any) -> Recording:
-        return capture_frames(rig, ScanPlan(PatternPlan()), folder, **options)
+    def capture(self, rig: Rig, _plan: ScanPlan, folder: Path, listener: Listener, /, **options: Any) -> Recording:
+        return capture_frames(rig, ScanPlan(PatternPlan()), folder, listener, **options)
 
 
 @pytest.mark.slow

@@ -19,11 +19,11 @@ from slrig.calibrate.store import CalibrationResult, PoseRecord, ReadPose, Sessi
 from slrig.calibration.board import Board, BoardKind, BoardShape, BoardView, PoseObservation, ViewQuality
 from slrig.devices import Rig
 from slrig.errors import PoseRefusedError
+from slrig.jobs.listener import Listener
 from slrig.jobs.manager import JobManager
 from slrig.jobs.resume import resume
 from slrig.model import Calibration, Size
 from slrig.rig.session import ActiveCalibration, RigSession
-from slrig.scan.plan import ProgressCallback
 from tests.samples import put_database
 from tests.unit.scan.bench import Bench, wait_for
 from tests.unit.scan.fakes import WAIT_S, TamePositioner, tame_calibration
@@ -108,16 +108,16 @@ class TameCalibrating:
         cameras: Mapping[str, Size],
         projector: Size | None,
         poses: Sequence[ReadPose],
+        listener: Listener,
         /,
         *,
-        progress: ProgressCallback,
         earlier: Calibration | None = None,
         board_shape: BoardShape = BoardShape.AUTO,
         tolerance_mm: float | None = None,
     ) -> CalibrationResult:
         assert (dict(cameras), projector) == ({"cam0": Size(64, 48)}, Size(64, 40))
         self.boards.append(board)
-        progress("adjust", 0.5, "turn 3")
+        listener.report("adjust", 0.5, "turn 3")
         assert self.solving.wait(WAIT_S)
         if self.solve_error is not None:
             raise self.solve_error

@@ -46,7 +46,7 @@ BOARD = Board(BoardKind.CHESSBOARD, 11, 8, 12.0)
 CALIBRATION = bench().calibration
 
 
-def capture(rig: Rig, _plan: object, folder: Path, /, **_options: object) -> TameRecording:
+def capture(rig: Rig, _plan: object, folder: Path, _listener: object, /) -> TameRecording:
     """Writes a bundle that has only its calibration."""
     folder.mkdir()
     if rig.calibration is not None:
@@ -170,7 +170,7 @@ def test_after_a_kill_one_that_waited_is_shot_and_one_under_way_is_interrupted(
 
 
 def test_a_recorded_pose_is_judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    capture(Rig("bench", {}, TameProjector(), {}, CALIBRATION), None, tmp_path / "pose")
+    capture(Rig("bench", {}, TameProjector(), {}, CALIBRATION), None, tmp_path / "pose", None)
     assert verify_bundle(tmp_path / "pose", BOARD, CALIBRATION).document() == a_verification().document()
     monkeypatch.setattr("slrig.calibrate.pose_reading.read_pose", moving)
     with pytest.raises(PoseRefusedError, match="put it on a stand"):

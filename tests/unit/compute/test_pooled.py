@@ -31,7 +31,7 @@ from slrig.compute.link import (
     Progress,
     Workers,
 )
-from slrig.compute.pooled import BEGIN_LIMIT_S, TRANSFER_LIMIT_S, NewsCallback, PoolClient, PooledWorker
+from slrig.compute.pooled import BEGIN_LIMIT_S, TRANSFER_LIMIT_S, PoolClient, PooledWorker
 from slrig.compute.security import PoolAddress
 from slrig.errors import (
     ConfigError,
@@ -44,6 +44,7 @@ from slrig.errors import (
 from slrig.jobs.data_folder import RESULT
 from slrig.jobs.database import versions
 from slrig.jobs.job import FrameFeed, JobRun, Outcome
+from slrig.jobs.listener import SILENT, Listener
 from slrig.jobs.worker import READY, Task
 from slrig.model import Region
 from slrig.scan.plan import ScanPlan
@@ -76,10 +77,8 @@ class TameWorker:
     def run(
         self,
         task: Task,
+        listener: Listener = SILENT,
         *,
-        progress: Callable[[str, float, str], None] = lambda *_: None,
-        cancelled: Callable[[], bool] = lambda: False,
-        made: Callable[[str], None] = lambda _: None,
         feed: FrameFeed | None = None,  # noqa: ARG002
         within_s: float | None = None,  # noqa: ARG002
     ) -> Any:
@@ -89,20 +88,20 @@ class TameWorker:
         files = task.files
         if files is None:
             return task.function(*task.given)
-        run = JobRun(files.id, files.folder, files.place, progress, cancelled, made, pipeline=fake_pipeline)
+        run = JobRun(
+            files.id, files.folder, files.place, report=listener.report, cancelled=listener.cancelled,
+            file_ready=listener.file_ready, pipeline=fake_pipeline,
+        )  # fmt: skip
         return task.function(run)
 
 
 class TameOrder(Future[PoolResponse]):
     """An order: `act` is asked for its answer."""
 
-    def __init__(
-        self, act: Callable[[PoolRequest], PoolResponse | None], order: PoolRequest, told: NewsCallback
-    ) -> None:
+    def __init__(self, act: Callable[[PoolRequest], PoolResponse | None], order: PoolRequest) -> None:
         super().__init__()
         self._act = act
         self.order = order
-        self.told = told
 
     def result(self, timeout: float | None = None) -> PoolResponse:  # noqa: ARG002
         if (answer := self._act(self.order)) is None:
@@ -131,11 +130,11 @@ class TameClient(PoolClient):
     def usable(self, timeout_s: float = 0.0) -> bool:  # noqa: ARG002
         return self.there
 
-    def submit(self, order: PoolRequest, told: NewsCallback) -> TameOrder:
+    def submit(self, order: PoolRequest, told: object) -> TameOrder:  # noqa: ARG002
         # As it crosses connections.
         order = PoolRequest.model_validate_json(order.model_dump_json())
         act = self.acts.pop(0) if self.acts else self.done
-        self.orders.append(TameOrder(act, order, told))
+        self.orders.append(TameOrder(act, order))
         return self.orders[-1]
 
     def done(self, order: PoolRequest) -> PoolResponse:
@@ -218,7 +217,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 def test_the_pool_gives_what_this_machine_gives(pool: Pool, tmp_path: Path) -> None:
     made: list[str] = []
-    found = pool.worker.run(job(tmp_path / "pooled"), made=made.append)
+    found = pool.worker.run(job(tmp_path / "pooled"), Listener(file_ready=made.append))
     pool.local.run(job(tmp_path / "local"))
     pooled, local = files(tmp_path / "pooled"), files(tmp_path / "local")
     # The tame report names the folder.
@@ -249,7 +248,7 @@ def test_members_of_one_user_find_one_another_and_listen_nowhere_else(pool: Pool
         try:
             assert client.usable(30), client.fault
             task, stages = job(tmp_path), list[str]()
-            assert rig.run(task, progress=lambda stage, *_: stages.append(stage)).summary["seconds"] == 1.5
+            assert rig.run(task, Listener(report=lambda stage, *_: stages.append(stage))).summary["seconds"] == 1.5
             assert files(tmp_path).keys() == FILES
             assert (stages, pool.local.done) == (["waiting for the pool", "decode", "done"], [])
             assert said == [f"computes for the pool {address}. Ctrl-C stops it."]
@@ -356,7 +355,7 @@ def test_what_fails_by_itself_fails_here_in_its_own_words(pool: Pool, tmp_path: 
 def test_a_job_that_is_cancelled_is_stopped_where_it_is_computed(pool: Pool, tmp_path: Path) -> None:
     pool.client.acts = [pool.passes(0.1)]
     with pytest.raises(ScanCancelledError, match="reconstruction was cancelled"):
-        pool.worker.run(job(tmp_path), cancelled=lambda: pool.now_s > 1)
+        pool.worker.run(job(tmp_path), Listener(cancelled=lambda: pool.now_s > 1))
     (pending,) = pool.client.orders
     assert pending.cancelled()
     assert pool.tidied() == set()
@@ -478,7 +477,7 @@ def test_a_machine_that_loses_its_process_leaves_the_job_to_another_try(
 
 
 def test_a_result_that_cannot_be_sent_is_a_fault(pool: Pool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def run(task: Task, **_: object) -> object:
+    def run(task: Task, _listener: Listener) -> object:
         return versions() if task.files is None else Outcome({"figure": object()})
 
     given = order(pool, tmp_path)
@@ -487,13 +486,13 @@ def test_a_result_that_cannot_be_sent_is_a_fault(pool: Pool, tmp_path: Path, mon
 
 
 def test_progress_is_sent_at_intervals(pool: Pool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def run(task: Task, *, progress: Callable[[str, float, str], None] = lambda *_: None, **_: object) -> object:
+    def run(task: Task, listener: Listener) -> object:
         if task.files is None:
             return versions()
         for number in range(10):
-            progress("read bundle", number / 10, "")
+            listener.report("read bundle", number / 10, "")
             pool.now_s += TELL_S / 3.9
-        progress("decode", 1.0, "")
+        listener.report("decode", 1.0, "")
         return None
 
     given = order(pool, tmp_path)
@@ -510,13 +509,13 @@ def test_a_file_travels_while_the_next_one_is_made(pool: Pool, tmp_path: Path, m
         gone.set()
         return digest
 
-    def run(task: Task, *, made: Callable[[str], None] = lambda _: None, **_: object) -> object:
+    def run(task: Task, listener: Listener) -> object:
         if task.files is None:
             return versions()
         result = task.files.folder / RESULT
         result.mkdir()
         (result / "mesh.ply").write_bytes(b"ply")
-        made("mesh.ply")
+        listener.file_ready("mesh.ply")
         assert gone.wait(30)
         (result / "report.json").write_bytes(b"{}")
         return Outcome({"triangles": 1})

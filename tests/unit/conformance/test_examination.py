@@ -39,6 +39,7 @@ from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError
 from slrig.jobs import manager as managing
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
+from slrig.jobs.listener import Listener
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import JobState
 from slrig.jobs.store import JobStore
@@ -96,7 +97,7 @@ def test_a_rig_that_does_not_open_is_not_examined() -> None:
 
     calls: list[str] = []
     with pytest.raises(DeviceBusyError, match="4711"):
-        run_checks(refuse, sequence(), progress=lambda stage, _fraction, _detail: calls.append(stage))
+        run_checks(refuse, sequence(), Listener(report=lambda stage, _fraction, _detail: calls.append(stage)))
     assert calls == []
 
 
@@ -124,7 +125,7 @@ def test_an_examination_that_is_interrupted_closes_the_rig() -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_checks(maker, sequence(), progress=interrupt)
+        run_checks(maker, sequence(), Listener(report=interrupt))
     assert all(rig.projector.closed.is_set() for rig in maker.rigs)  # type: ignore[attr-defined]
     assert owners() <= before
 
@@ -133,7 +134,7 @@ def test_checks_have_names_and_progress_is_reported_before_and_after_each() -> N
     calls: list[tuple[str, float, str]] = []
     assert len({each.name for each in CHECKS}) == len({each.title for each in CHECKS}) == len(CHECKS)
     first, second = CHECKS[:2]
-    run_checks(Maker(), sequence(), checks=(first, second), progress=lambda *what: calls.append(what))
+    run_checks(Maker(), sequence(), Listener(report=lambda *what: calls.append(what)), checks=(first, second))
     assert calls == [
         *((first.title, 0.0, ""), (first.title, 0.5, "passed")),
         *((second.title, 0.5, ""), (second.title, 1.0, "passed")),

@@ -24,6 +24,7 @@ from slrig.doctor.image import check_calibrated, check_sharpening, measure_respo
 from slrig.doctor.light import CameraSession, Finding, Severity, locate_picture, measure_light
 from slrig.doctor.measures import depth_mm_per_px
 from slrig.errors import FrameTimeoutError, ScanEvidenceError, UnsupportedByDeviceError
+from slrig.jobs.listener import Listener
 from slrig.model import FloatArray, Frame, PatternSequence, Pinhole, Pixels, Size, White
 from slrig.patterns.sequence import encode, scan_patterns
 from tests.unit.capture.fake_rig import CameraFaults, fake_rig
@@ -162,7 +163,7 @@ def test_sound_rig_is_sound_by_any_trigger_though_frames_are_lost(rig: Rig, trig
     steps: list[str] = []
     diagnosis = run_doctor(
         with_camera(rig, triggers=frozenset({trigger}), lose=range(5, 400, 31)),
-        progress=lambda step, _fraction, _detail: steps.append(step),
+        listener=Listener(report=lambda step, _fraction, _detail: steps.append(step)),
     )
     assert diagnosis.with_severity(Severity.FAULT) == ()
     assert diagnosis.with_severity(Severity.NOTE) == ()
@@ -205,7 +206,7 @@ def test_vague_time_stamps_are_not_blamed_on_the_projector(rig: Rig, is_stated: 
     )
     assert light is not None
     scans_s = {"eye": light.exposure_s}
-    _, findings = timing.measure_light_latency(rig, {"eye": light}, scans_s, search_s=0.1, progress=lambda *_: None)
+    _, findings = timing.measure_light_latency(rig, {"eye": light}, scans_s, search_s=0.1)
     [found] = [each for each in findings if each.name in {"timing.stamps", "timing.jitter"}]
     assert found.name == name
     assert found.subject == ("camera 'eye'" if is_stated else "projector")
@@ -229,9 +230,7 @@ def test_pictures_that_nobody_sent_are_named(rig: Rig, monkeypatch: pytest.Monke
     monkeypatch.setattr(timing, "measure_latency", lambda *_, **__: replace(found, cameras={"eye": eye}))
     light, _ = measure_light(CameraSession(rig, "eye"), doctor_sequence(rig.projector.info.size), displays="")
     assert light is not None
-    _, findings = timing.measure_light_latency(
-        rig, {"eye": light}, {"eye": light.exposure_s}, search_s=0.1, progress=lambda *_: None
-    )
+    _, findings = timing.measure_light_latency(rig, {"eye": light}, {"eye": light.exposure_s}, search_s=0.1)
     said = [each.found for each in findings if each.name == "timing.interpolated"]
     assert len(said) == (halfway_s > 0)
     assert all("stands halfway for 16.7 ms" in each for each in said)

@@ -10,9 +10,10 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
-from slrig.errors import ScanCancelledError, WorkerBusyError
+from slrig.errors import WorkerBusyError
 from slrig.failure import interruption_error
 from slrig.jobs.job import FedCaptures, FrameFeed, JobRun
+from slrig.jobs.listener import SILENT, Listener
 from slrig.jobs.worker import READY, Task
 from slrig.model import Region
 from tests.unit.scan.fakes import WAIT_S
@@ -52,55 +53,46 @@ class TameCompute:
     def run(
         self,
         task: Task,
+        listener: Listener = SILENT,
         *,
-        progress: Callable[[str, float, str], None] = lambda *_: None,
-        cancelled: Cancelled = lambda: False,
-        made: Callable[[str], None] = lambda _: None,
         feed: FrameFeed | None = None,
         within_s: float | None = None,
     ) -> Any:
-        def told(stage: str, fraction: float, detail: str) -> None:
-            if self._closed.is_set():
-                raise interruption_error()
-            progress(stage, fraction, detail)
-
         self.jobs += 1
         try:
-            self._take_turn(task, cancelled, within_s)
+            self._take_turn(task, listener, within_s)
             try:
-                return self._done(task, told, cancelled, made, feed)
+                return self._done(task, listener, feed)
             finally:
                 self._turn.release()
         finally:
             self.jobs -= 1
 
-    def _take_turn(self, task: Task, cancelled: Cancelled, within_s: float | None) -> None:
+    def _take_turn(self, task: Task, listener: Listener, within_s: float | None) -> None:
         until_s = math.inf if within_s is None else time.monotonic() + within_s
         while not self._turn.acquire(timeout=0.01):
             if self._closed.is_set():
                 raise interruption_error()
-            if cancelled():
-                raise ScanCancelledError(f"The {task.what} was cancelled.")
+            listener.check(f"The {task.what} was cancelled.")
             if time.monotonic() > until_s:
                 raise WorkerBusyError(f"Another job is computed, and the {task.what} has to wait. Ask again.")
 
-    def _done(
-        self,
-        task: Task,
-        told: Callable[[str, float, str], None],
-        cancelled: Cancelled,
-        made: Callable[[str], None],
-        feed: FrameFeed | None,
-    ) -> Any:
+    def _done(self, task: Task, listener: Listener, feed: FrameFeed | None) -> Any:
+        def told(stage: str, fraction: float, detail: str) -> None:
+            if self._closed.is_set():
+                raise interruption_error()
+            listener.report(stage, fraction, detail)
+
         files = task.files
         if files is None:
             return task.function(*task.given)
-        self._before(cancelled)
+        self._before(listener.cancelled)
         whole = feed is not None and feed.settled(WAIT_S) and feed.whole
         live = self._captures.taken(feed.number) if feed is not None and whole else None
         run = JobRun(
-            files.id, files.folder, files.place, told, cancelled, made,
-            live=live, evidence=files.evidence, where=task.where, pipeline=self._pipeline,
+            files.id, files.folder, files.place, report=told, cancelled=listener.cancelled,
+            file_ready=listener.file_ready, live=live, evidence=files.evidence, where=task.where,
+            pipeline=self._pipeline,
         )  # fmt: skip
         return task.function(run)
 

@@ -21,6 +21,7 @@ from slrig.calibrate.verification import HealthStore, RigHealth, VerificationJob
 from slrig.doctor import DoctorJob
 from slrig.errors import DeviceGoneError, OutOfMemoryError, RigBusyError, ScanCancelledError, ScanInterruptedError
 from slrig.jobs.data_folder import FILES
+from slrig.jobs.listener import Listener
 from slrig.jobs.records import JobKind, JobRecord, JobState
 from slrig.model_jobs.job import TURNTABLE, Models
 from slrig.model_jobs.plan import ModelPlan, StatedAxis, TurntablePoses
@@ -68,7 +69,7 @@ class Service(Bench):
         tame = TameCalibrating()
         self.patched.enter_context(tame.patched())
 
-        def evaluate(_bundle: Path, folder: Path, _plan: object, step: Step, take: int, **_: Any) -> Reading:
+        def evaluate(_bundle: Path, folder: Path, _plan: object, step: Step, take: int, _listener: Listener) -> Reading:
             points = folder / points_file(step.name, take)
             points.parent.mkdir(parents=True, exist_ok=True)
             points.touch()

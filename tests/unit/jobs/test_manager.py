@@ -31,6 +31,7 @@ from slrig.jobs import manager as managing
 from slrig.jobs.data_folder import FILES, DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.job import Job, JobRun, Outcome, Recording
+from slrig.jobs.listener import Listener
 from slrig.jobs.records import Holder, JobKind, JobRecord, JobState, holder_of
 from slrig.jobs.resume import resume
 from slrig.jobs.store import JobStore
@@ -278,14 +279,14 @@ def test_work_that_never_returns_is_darkened_past_and_ends_once(bench: Bench) ->
 
 
 def test_rig_is_lent_for_some_seconds_and_nothing_is_on_record(bench: Bench) -> None:
-    def look(rig: RigSession, cancelled: Callable[[], bool]) -> str:
-        assert not cancelled()
+    def look(rig: RigSession, listener: Listener) -> str:
+        assert not listener.cancelled()
         rig.open().projector.show(0)
         with pytest.raises(RigBusyError, match="measuring 7"):
             bench.scan()
         return threading.current_thread().name
 
-    def fail(_rig: RigSession, _cancelled: Callable[[], bool]) -> None:
+    def fail(_rig: RigSession, _listener: Listener) -> None:
         raise DeviceGoneError("Camera 'cam0' was unplugged.")
 
     assert bench.manager.lend(LENT, look) == "slrig-rig"

@@ -40,6 +40,7 @@ from slrig.jobs.job import (
     Outcome,
     most_waiting_bytes,
 )
+from slrig.jobs.listener import Listener
 from slrig.jobs.worker import (
     LOADING,
     READY,
@@ -108,7 +109,7 @@ def killed(worker: Worker) -> None:
 
 def test_report_and_progress_come_back(worker: Worker, tmp_path: Path) -> None:
     told = Told()
-    found = worker.run(job(tmp_path, "finish"), progress=told)
+    found = worker.run(job(tmp_path, "finish"), Listener(report=told))
     assert found == Outcome({"bundle": tmp_path.name, "seconds": 1.5, "truth": {"rms_mm": 0.01}})
     assert report_in(tmp_path)["stages"] == [1, 2]
     assert b"keep_holes=True" in (tmp_path / "result" / "points.ply").read_bytes()
@@ -117,33 +118,33 @@ def test_report_and_progress_come_back(worker: Worker, tmp_path: Path) -> None:
 
 def test_error_keeps_its_class_and_message(worker: Worker, tmp_path: Path) -> None:
     with pytest.raises(NothingToReconstructError, match="No stripe was found"):
-        worker.run(job(tmp_path, "fail"), progress=Told())
+        worker.run(job(tmp_path, "fail"))
 
 
 def test_defect_carries_its_traceback(worker: Worker, tmp_path: Path) -> None:
     with pytest.raises(UnexpectedWorkerError, match=r"fake_pipeline\.py[\s\S]*an index error, say"):
-        worker.run(job(tmp_path, "break"), progress=Told())
+        worker.run(job(tmp_path, "break"))
 
 
 def test_job_stops_when_asked_and_the_process_stays(worker: Worker, tmp_path: Path) -> None:
     told = Told()
     before = worker.process_id
     with pytest.raises(ScanCancelledError):
-        worker.run(job(tmp_path, "hang"), progress=told, cancelled=lambda: ("mesh", 0.5) in told.stages)
+        worker.run(job(tmp_path, "hang"), Listener(report=told, cancelled=lambda: ("mesh", 0.5) in told.stages))
     assert worker.process_id == before
 
 
 def test_killed_process_is_named_and_replaced(worker: Worker, tmp_path: Path) -> None:
     before = worker.process_id
     with pytest.raises(WorkerLostError, match=signal.Signals.SIGKILL.name):
-        worker.run(job(tmp_path, "die"), progress=Told())
-    assert worker.run(job(tmp_path, "finish"), progress=Told()).summary["seconds"] == 1.5
+        worker.run(job(tmp_path, "die"))
+    assert worker.run(job(tmp_path, "finish")).summary["seconds"] == 1.5
     assert worker.process_id != before
 
 
 def test_process_killed_while_idle_costs_nothing_but_a_new_one(worker: Worker, tmp_path: Path) -> None:
     killed(worker)
-    assert worker.run(job(tmp_path, "finish"), progress=Told()).summary["seconds"] == 1.5
+    assert worker.run(job(tmp_path, "finish")).summary["seconds"] == 1.5
 
 
 def test_deaf_job_loses_its_process(worker: Worker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,7 +152,7 @@ def test_deaf_job_loses_its_process(worker: Worker, tmp_path: Path, monkeypatch:
     told = Told()
     before = worker.process_id
     with pytest.raises(ScanCancelledError):
-        worker.run(job(tmp_path, "hang-deaf"), progress=told, cancelled=lambda: ("mesh", 0.5) in told.stages)
+        worker.run(job(tmp_path, "hang-deaf"), Listener(report=told, cancelled=lambda: ("mesh", 0.5) in told.stages))
     worker.start()
     assert worker.process_id != before
 
@@ -174,7 +175,7 @@ def test_an_answer_that_came_too_late_is_dropped(worker: Worker, tmp_path: Path)
 
     left = worker.process_id
     with pytest.raises(KeyboardInterrupt):
-        worker.run(job(tmp_path, "finish"), progress=refuse)
+        worker.run(job(tmp_path, "finish"), Listener(report=refuse))
     assert worker.run(task("process_id")) == worker.process_id != left
     assert worker.run(job(tmp_path / "again", "finish")).summary["seconds"] == 1.5
 
@@ -185,7 +186,8 @@ def test_an_answer_of_another_job_is_dropped() -> None:
     made: list[str] = []
     process = multiprocessing.get_context("spawn").Process(target=time.monotonic)
     process.start()
-    job = JobWait(task("process_id"), 7, process, near, stops, c_double(), Told(), bool, made.append, lambda _: None)
+    listener = Listener(cancelled=bool, file_ready=made.append)
+    job = JobWait(task("process_id"), 7, process, near, stops, c_double(), listener, lambda _: None)
     for answer in (
         Done(6, "of the job before"),
         Progressed(6, "mesh", 0.5, ""),
@@ -232,7 +234,7 @@ def test_jobs_have_their_turn_in_the_order_in_which_they_came(worker: Worker, tm
     told = Told()
 
     def do(name: str) -> None:
-        ended.append(worker.run(task("wait_for", tmp_path / name), progress=told))
+        ended.append(worker.run(task("wait_for", tmp_path / name), Listener(report=told)))
 
     first, second = (threading.Thread(target=do, args=(name,)) for name in ("first", "second"))
     first.start()
@@ -242,7 +244,7 @@ def test_jobs_have_their_turn_in_the_order_in_which_they_came(worker: Worker, tm
     while (WAITING, 0.0) not in told.stages:
         threading.Event().wait(0.01)
     with pytest.raises(ScanCancelledError):
-        worker.run(task("process_id"), cancelled=lambda: True)
+        worker.run(task("process_id"), Listener(cancelled=lambda: True))
     (tmp_path / "second").touch()
     (tmp_path / "first").touch()
     first.join(WAIT_S)
@@ -273,8 +275,8 @@ def test_how_far_the_kernels_are_is_told_before_and_during_a_job(
         return False
 
     fresh.run(
-        job(tmp_path, "finish"), progress=lambda stage, _, detail: told.append(f"{stage} {detail}".strip()),
-        cancelled=go_on, feed=feed,
+        job(tmp_path, "finish"),
+        Listener(report=lambda stage, _, detail: told.append(f"{stage} {detail}".strip()), cancelled=go_on), feed=feed,
     )  # fmt: skip
     assert report_in(tmp_path)["live"] == [2, 2, True]
     assert told[:2] == ["preparing kernels first time only: 42 of 118", "decode"]
@@ -289,7 +291,7 @@ def test_process_that_ends_while_it_loads_is_told(tmp_path: Path) -> None:
     cause = "the reconstruction cannot be loaded: its process ended"
     assert cause in broken.condition
     with pytest.raises(WorkerLostError, match=cause):
-        broken.run(job(tmp_path, "finish"), progress=Told())
+        broken.run(job(tmp_path, "finish"))
     assert cause in broken.condition
     broken.close()
 
@@ -338,7 +340,7 @@ def test_closed_worker_starts_no_process(tmp_path: Path) -> None:
     closed = Worker(PIPELINE)
     closed.close()
     with pytest.raises(ScanInterruptedError):
-        closed.run(job(tmp_path, "finish"), progress=Told())
+        closed.run(job(tmp_path, "finish"))
     assert closed.process_id is None
 
 
@@ -536,7 +538,7 @@ def run(worker: Worker, tmp_path: Path) -> Ran:
     """Run a job after a capture; return what the reconstruction says of the frames that it was sent."""
 
     def ran(feed: FrameFeed, cancelled: Callable[[], bool] = lambda: False) -> object:
-        worker.run(job(tmp_path, "finish"), cancelled=cancelled, feed=feed)
+        worker.run(job(tmp_path, "finish"), Listener(cancelled=cancelled), feed=feed)
         return report_in(tmp_path).get("live")
 
     return ran

@@ -10,8 +10,8 @@ from typing import Any
 from uuid import UUID, uuid4
 
 from slrig.bundle.options import AxisSource
-from slrig.errors import ScanCancelledError
 from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.listener import Listener
 from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, utc_now
 from slrig.jobs.resume import resume
 from slrig.jobs.store import JobStore
@@ -20,7 +20,7 @@ from slrig.model_jobs.job import TURNTABLE, Models
 from slrig.model_jobs.plan import MEDIA_TYPES, REPORT, StartingPoses
 from slrig.model_jobs.turntable import TurntableStore
 from slrig.scan.job import plan_json
-from slrig.scan.plan import ProgressCallback, ScanPlan
+from slrig.scan.plan import ScanPlan
 from tests.samples import put_database
 from tests.unit.scan.bench import Bench, wait_for
 from tests.unit.stand_ins import stand_ins
@@ -63,24 +63,21 @@ class TameCombining:
         meshes: Mapping[str, Path],
         folder: Path,
         poses: StartingPoses,
+        listener: Listener,
         /,
         *,
         start_error_mm: float,
         voxel_mm: float | None,
         planes: Sequence[TurntablePlane],
         notes: Sequence[str],
-        progress: ProgressCallback,
-        cancelled: Callable[[], bool],
     ) -> None:
         self.planes = planes
         self.asked.append((meshes, poses, start_error_mm, voxel_mm))
         assert list(folder.iterdir()) == []
-        progress("registering", 0.2, f"{len(meshes)} views")
+        listener.report("registering", 0.2, f"{len(meshes)} views")
         self.began.set()
         while not self.gate.wait(0.01):
-            if cancelled():
-                message = "the model was cancelled"
-                raise ScanCancelledError(message)
+            listener.check("the model was cancelled")
         if self.error is not None:
             error, self.error = self.error, None
             raise error

@@ -29,6 +29,7 @@ from slrig.errors import (
 from slrig.failure import interruption_error, job_failure
 from slrig.jobs.data_folder import FILES
 from slrig.jobs.job import Recording
+from slrig.jobs.listener import Listener
 from slrig.jobs.records import RECORD, JobKind, JobProgress, JobRecord, JobState, utc_now, write_record
 from slrig.jobs.resume import resume
 from slrig.jobs.retention import CLOCK, JobArchive, Limits, Retention, SteadyClock
@@ -286,11 +287,11 @@ class ShootingBench(ModelBench):
     def open_rig(self) -> Rig:
         return replace(super().open_rig(), positioner=self.table)
 
-    def capture(self, rig: Rig, plan: ScanPlan, folder: Path, /, **how: Any) -> Recording:
+    def capture(self, rig: Rig, plan: ScanPlan, folder: Path, listener: Listener, /, **how: Any) -> Recording:
         self.shot.append(plan.turn_deg)
         if faults := self.faults.get(plan.turn_deg or 0.0):
             raise faults.pop(0)
-        return super().capture(rig, plan, folder, **how)
+        return super().capture(rig, plan, folder, listener, **how)
 
     def views(self, model_id: UUID) -> list[tuple[float | None, JobState]]:
         """Angle and state of each scan of a model, from the first to the last."""

@@ -8,7 +8,7 @@ import os
 import resource
 import signal
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -16,6 +16,7 @@ import numpy as np
 
 from slrig.capture.verifier import EvidenceSummary
 from slrig.errors import NothingToReconstructError, ScanCancelledError
+from slrig.jobs.listener import Listener
 from slrig.model import Calibration, Mesh, Region, Shot
 from slrig.model.capture import CaptureHeader
 from slrig.scan.artefacts import MESH, encode_mesh_ply
@@ -99,18 +100,16 @@ def exhaust(*_given: object, **_options: object) -> None:
 def reconstruct_into(
     bundle: Path,
     folder: Path,
+    listener: Listener,
     *,
     plan: ReconstructionPlan,
-    progress: Callable[[str, float, str], None],
-    cancelled: Callable[[], bool],
-    made: Callable[[str], None] = lambda _: None,
     live: LiveScan | None = None,
     judged: EvidenceSummary | None = None,  # noqa: ARG001 - as it is called
     where: Mapping[str, str] | None = None,
 ) -> Mapping[str, object]:
     """Do what `bundle/order` says: finish, fail, break, die, or wait to be cancelled."""
     order = (bundle / "order").read_text()
-    progress("decode", 0.1, "")
+    listener.report("decode", 0.1, "")
     if order == "fail":
         message = "No stripe was found in any frame."
         raise NothingToReconstructError(message)
@@ -120,17 +119,17 @@ def reconstruct_into(
     if order == "die":
         _die()
     if order in {"hang", "hang-deaf"}:
-        while order == "hang-deaf" or not cancelled():
-            progress("mesh", 0.5, "")
+        while order == "hang-deaf" or not listener.cancelled():
+            listener.report("mesh", 0.5, "")
             threading.Event().wait(0.01)
         message = "The reconstruction was cancelled."
         raise ScanCancelledError(message)
     # A real one, because other formats are made of it.
     (folder / MESH).write_bytes(encode_mesh_ply(TRIANGLE))
-    made(MESH)
+    listener.file_ready(MESH)
     if order == "mesh-first":
         while not (bundle / "go-on").exists():
-            progress("pictures", 0.8, "")
+            listener.report("pictures", 0.8, "")
             threading.Event().wait(0.01)
     (folder / "mesh.glb").write_bytes(encode_mesh_glb(TRIANGLE))
     (folder / "points.ply").write_bytes(f"points of {plan}".encode())
@@ -145,5 +144,5 @@ def reconstruct_into(
     if live is not None:
         report["live"] = [live.taken, live.listed, live.ended]
     (folder / "report.json").write_text(json.dumps(report))
-    progress("done", 1.0, "")
+    listener.report("done", 1.0, "")
     return report

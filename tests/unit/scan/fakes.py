@@ -19,6 +19,7 @@ from slrig.discovery import DiscoveredDevices
 from slrig.doctor import Diagnosis
 from slrig.errors import ScanCancelledError
 from slrig.jobs.job import FrameSink, JobRun, Recording
+from slrig.jobs.listener import Listener
 from slrig.jobs.worker import Task, job_task
 from slrig.model import (
     Axis,
@@ -84,7 +85,7 @@ class SetClock:
 
 def reconstruction(folder: Path, plan: ReconstructionPlan = ReconstructionPlan()) -> Task:  # noqa: B008 - frozen
     """The second part of a scan whose bundle lies in a folder, as the worker is given it."""
-    run = JobRun(uuid4(), folder, None, lambda *_: None, lambda: False)
+    run = JobRun(uuid4(), folder, None)
     return job_task(ScanJob(ScanPlan(reconstruction=plan)), run)
 
 
@@ -208,12 +209,12 @@ class TameBench:
         functions["doctor.job.discover_devices"] = lambda: DiscoveredDevices((), (), ())
         return stand_ins(functions)
 
-    def examine(self, rig: Rig, *, progress: Callable[[str, float, str], None], **_: Any) -> Diagnosis:
+    def examine(self, rig: Rig, listener: Listener, /, **_: Any) -> Diagnosis:
         """An examination that finds nothing but its rig."""
         rig.projector.show(0)
         self.began.set()
         while not self.gate.wait(0.01):
-            progress("light", 0.5, "")
+            listener.step("light", 0.5, "")
         if self.error is not None:
             error, self.error = self.error, None
             raise error
@@ -233,10 +234,9 @@ class TameBench:
         rig: Rig,
         plan: ScanPlan,
         folder: Path,
+        listener: Listener,
         /,
         *,
-        progress: Callable[[str, float, str], None],
-        cancelled: Callable[[], bool],
         frames: FrameSink | None = None,
         health: Mapping[str, Any] | None = None,
     ) -> Recording:
@@ -245,10 +245,10 @@ class TameBench:
         if frames is not None:
             frames.begin(OUTLINE, CALIBRATION)
             frames.take(SHOTS[0])
-        progress("capture", 0.0, "frame 1 of 2")
+        listener.report("capture", 0.0, "frame 1 of 2")
         self.began.set()
         while not self.gate.wait(0.01):
-            if cancelled() and not self.deaf:
+            if listener.cancelled() and not self.deaf:
                 message = "The scan was cancelled."
                 raise ScanCancelledError(message)
         if self.error is not None:
@@ -264,5 +264,5 @@ class TameBench:
         if frames is not None:
             frames.take(SHOTS[1])
             frames.end(EVIDENCE)
-        progress("capture", 1.0, "frame 2 of 2")
+        listener.report("capture", 1.0, "frame 2 of 2")
         return self.recording

@@ -31,6 +31,7 @@ from slrig.errors import (
     UnsupportedByDeviceError,
 )
 from slrig.jobs.job import Abandon, FrameFeed
+from slrig.jobs.listener import Listener
 from slrig.model import Axis, Black, Calibration, CameraFormat, Shot, Size, White
 from slrig.model.capture import CaptureHeader
 from slrig.scan.acquisition import Recorder, capture_frames, exposed
@@ -88,8 +89,7 @@ def captured(
             fake.rig,
             plan or ScanPlan(),
             folder,
-            progress=lambda _stage, fraction, detail: told.append((fraction, detail)),
-            cancelled=cancelled,
+            Listener(report=lambda _stage, fraction, detail: told.append((fraction, detail)), cancelled=cancelled),
             frames=sink,
         ).finish()
     finally:
@@ -119,7 +119,7 @@ def test_a_rig_whose_latency_was_never_measured_says_so(tmp_path: Path) -> None:
         known = replace(free, synchronisation=Synchronisation(0.0, 0.001))
         for name, each in (("unmeasured", free), ("measured", known), ("triggered", rig)):
             plan = ScanPlan(PatternPlan(line_shift=False, gray_cell_px=16))
-            capture_frames(each, plan, tmp_path / name, progress=lambda *_: None, cancelled=lambda: False).finish()
+            capture_frames(each, plan, tmp_path / name).finish()
     [note] = read_notes(tmp_path / "unmeasured")
     assert "cameras that run by themselves (eye)" in note
     assert "Run slrig latency" in note
@@ -134,7 +134,7 @@ def test_frames_that_light_is_too_late_for_ask_to_measure_it(tmp_path: Path, mea
         free = {"eye": OtherCamera(rig.cameras["eye"], triggers=frozenset({Trigger.FREE}))}
         late = replace(rig, cameras=free, synchronisation=measured)
         with pytest.raises(ScanEvidenceError) as raised:
-            capture_frames(late, plan, tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False)
+            capture_frames(late, plan, tmp_path / "bundle")
     assert ("never measured on this rig" in str(raised.value)) is (measured is None)
 
 
@@ -372,7 +372,7 @@ def test_frames_are_written_in_order_by_a_thread_of_its_own(tmp_path: Path) -> N
     with writer, Recorder(writer) as recorder:
         for shot in SHOTS:
             recorder.add(shot)
-        recorder.refuse(RefusedFrame(0, "cam0", 1, "it was stale", delivered=True))
+        recorder.add(RefusedFrame(0, "cam0", 1, "it was stale", delivered=True))
         recorder.add(SHOTS[0])
         # All of this while the disk did nothing.
         writer.gate.set()

@@ -68,9 +68,7 @@ def test_a_missing_bit_is_told_and_the_others_are_decoded(tmp_path: Path) -> Non
 
 def test_a_missing_bit_leaves_a_mesh_of_the_others(tmp_path: Path) -> None:
     bundle = without_finest_bit(tmp_path / "b")
-    report = reconstruct_bundle(
-        bundle, tmp_path / "out", plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False
-    )
+    report = reconstruct_bundle(bundle, tmp_path / "out", plan=ReconstructionPlan())
     assert "bit 6 of the 6" in str(report["notes"])
     assert len(trimesh.load_mesh(tmp_path / "out" / "mesh.ply", process=False).faces) > 200
 

@@ -39,10 +39,7 @@ class Scanned:
         key = f"{region}{live is None}"
         if key not in self.made:
             output = self.folder / f"out{len(list(self.folder.iterdir()))}"
-            reconstruct_bundle(
-                self.bundle, output, plan=ReconstructionPlan(region=region), progress=lambda *_: None,
-                cancelled=lambda: False, live=live,
-            )  # fmt: skip
+            reconstruct_bundle(self.bundle, output, plan=ReconstructionPlan(region=region), live=live)
             report = json.loads((output / "report.json").read_text())
             self.made[key] = decode_mesh_ply((output / "mesh.ply").read_bytes()), report, output
         return self.made[key]

@@ -39,13 +39,7 @@ def test_a_recorded_scan_compiles_nothing_more(shared: Path, tmp_path: Path) -> 
     late: list[str] = []
     plan = ReconstructionPlan()
     with report_compilations(late.append):
-        pipeline.reconstruct_bundle(
-            shared / "bundles" / "terrace",
-            tmp_path / "out",
-            plan=plan,
-            progress=lambda *_: None,
-            cancelled=lambda: False,
-        )
+        pipeline.reconstruct_bundle(shared / "bundles" / "terrace", tmp_path / "out", plan=plan)
     # The truth beside this bundle is compared with by a search tree, which scans do without.
     of_truth = {"boxes", "box_gap", "box_entry", "squared_distances", "ray_hits", "nearest_on_triangle"}
     assert not {name for name in late if "<locals>" not in name} - of_truth - {"segment_gap", "ray_meets_triangle"}

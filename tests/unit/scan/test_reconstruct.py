@@ -37,6 +37,7 @@ from slrig.errors import (
     SlrigError,
 )
 from slrig.jobs.database import versions
+from slrig.jobs.listener import Listener
 from slrig.model import (
     Axis,
     Black,
@@ -90,8 +91,6 @@ def run(
         output,
         plan=ReconstructionPlan(**options),
         calibration=calibration,
-        progress=lambda *_: None,
-        cancelled=lambda: False,
         live=live,
     )
 
@@ -290,9 +289,7 @@ def test_a_cancelled_reconstruction_leaves_nothing(recorded: Path, tmp_path: Pat
         return len(calls) > 3
 
     with pytest.raises(ScanCancelledError):
-        reconstruct_bundle(
-            recorded, tmp_path / "out", plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=cancelled
-        )
+        reconstruct_bundle(recorded, tmp_path / "out", Listener(cancelled=cancelled), plan=ReconstructionPlan())
     assert list(tmp_path.iterdir()) == []
 
 
@@ -367,8 +364,8 @@ def test_frames_that_were_judged_as_they_were_captured_are_not_judged_again(
     (tmp_path / "judged").mkdir()
     told: list[str] = []
     judged = reconstruct_into(
-        recorded, tmp_path / "judged", plan=ReconstructionPlan(), progress=lambda stage, *_: told.append(stage),
-        cancelled=lambda: False, judged=seen_live(recorded).evidence,
+        recorded, tmp_path / "judged", Listener(report=lambda stage, *_: told.append(stage)),
+        plan=ReconstructionPlan(), judged=seen_live(recorded).evidence,
     )  # fmt: skip
     # Each stage is entered once, though frames are read one by one between them.
     assert told[0] == "read bundle"
@@ -538,7 +535,7 @@ def slanted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("slanted")
     with open_rig(read_rig(rig_file(folder / "rig", BALL, PROJECTOR, CAMERA))) as rig:
         plan = ScanPlan(patterns=PatternPlan(rows=True, line_shift=False, gray_cell_px=1))
-        capture_frames(rig, plan, folder / "bundle", progress=lambda *_: None, cancelled=lambda: False).finish()
+        capture_frames(rig, plan, folder / "bundle").finish()
     return folder / "bundle"
 
 

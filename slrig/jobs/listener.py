@@ -1,0 +1,59 @@
+"""Who follows a call that takes long: is told how far it is, and says whether it is to go on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from slrig.errors import ScanCancelledError
+
+
+def _silent(_stage: str, _fraction: float, _detail: str) -> None:
+    pass
+
+
+def _never() -> bool:
+    return False
+
+
+def _unheard(_file: str) -> None:
+    pass
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Listener:
+    """report : takes the stage, the fraction of the whole call that is done, 0 to 1, and a detail for people. cancelled
+    : whether the call is to end early, by ScanCancelledError. file_ready : takes the name of a file that can be fetched
+    before the call is over.
+    """
+
+    report: Callable[[str, float, str], None] = _silent
+    cancelled: Callable[[], bool] = _never
+    file_ready: Callable[[str], None] = _unheard
+
+    def check(self, message: str = "It was cancelled.") -> None:
+        """Raise ScanCancelledError once the call is to end early."""
+        if self.cancelled():
+            raise ScanCancelledError(message)
+
+    def step(self, stage: str, fraction: float, detail: str, /) -> None:
+        """Report progress, and raise ScanCancelledError once the call is to end early."""
+        self.report(stage, fraction, detail)
+        self.check()
+
+    def within(self, begin: float, end: float, name: str = "") -> Listener:
+        """Of a call that is this one's part from one fraction to another. name : goes before its stages."""
+
+        def report(stage: str, fraction: float, detail: str) -> None:
+            whole = begin + (end - begin) * min(max(fraction, 0.0), 1.0)
+            self.report(f"{name}: {stage}" if name else stage, whole, detail)
+
+        return Listener(report=report, cancelled=self.cancelled)
+
+    def part(self, number: int, count: int, name: str = "") -> Listener:
+        """Of one of `count` calls that make up this one, alike long. number : from 0."""
+        return self.within(number / count, (number + 1) / count, name)
+
+
+SILENT = Listener()
+"""Nobody follows the call, and it goes on to its end."""
