@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,8 +46,10 @@ SCENES = {
     "12 bit": {"bit_depth": 12, "noise_dn": 6.0},
 }
 
-FEW = ("noisy", "defocused", "projector with gamma 2.2")
-"""The others in the long run."""
+
+def few(*names: Any, of: Iterable[Any]) -> list[Any]:
+    """These, and the others in the long run."""
+    return [*names, *(pytest.param(each, marks=pytest.mark.slow) for each in of if each not in names)]
 
 
 def scene(name: str = "noisy") -> Scene:
@@ -62,9 +65,7 @@ def summary(patterns: Sequence[Pattern], frames: Sequence[Pixels], stage: Scene 
     return check_capture(Capture(PROJECTOR, tuple(patterns), {"left": (stage or scene()).format}, shots))
 
 
-@pytest.mark.parametrize(
-    "name", [*FEW, *(pytest.param(each, marks=pytest.mark.slow) for each in SCENES if each not in FEW)]
-)
+@pytest.mark.parametrize("name", few("noisy", of=SCENES))
 @pytest.mark.parametrize("sequence", SEQUENCES)
 def test_right_frames_are_verified(sequence: str, name: str) -> None:
     patterns, stage = SEQUENCES[sequence], scene(name)
@@ -106,11 +107,8 @@ def exchanged(frames: list[Pixels], index: int) -> list[int]:
     return [index - 3, index]
 
 
-@pytest.mark.parametrize(
-    "spoil",
-    [stale, *(pytest.param(each, marks=pytest.mark.slow) for each in (torn, early, garbled, dark_rows, exchanged))],
-)
-@pytest.mark.parametrize("sequence", SEQUENCES)
+@pytest.mark.parametrize("spoil", few(stale, of=(torn, early, garbled, dark_rows, exchanged)))
+@pytest.mark.parametrize("sequence", few("2x3", "a code and four", of=SEQUENCES))
 def test_a_wrong_frame_is_named_once_and_no_other(
     sequence: str, spoil: Callable[[list[Pixels], int], list[int]]
 ) -> None:
@@ -148,7 +146,7 @@ def test_a_period_that_runs_backwards_contradicts_the_other() -> None:
     assert re.search(r"run opposite|exchanged", fault)
 
 
-@pytest.mark.parametrize(("one", "other"), [(2, 3), (2, 4)])
+@pytest.mark.parametrize(("one", "other"), [pytest.param(2, 3, marks=pytest.mark.slow), (2, 4)])
 def test_exchanged_frames_that_fit_other_positions_are_found_by_their_jumps(one: int, other: int) -> None:
     patterns = SEQUENCES["micro"]
     frames = images(patterns)
@@ -185,7 +183,7 @@ def test_stale_and_garbled_frames_are_shot_again() -> None:
 
 
 @pytest.mark.parametrize("factor", [1.25, pytest.param(0.7, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("sequence", ["three periods of four", "2x3", "micro"])
+@pytest.mark.parametrize("sequence", few("2x3", of=("three periods of four", "micro")))
 def test_a_change_of_light_is_measured_and_no_fault(sequence: str, factor: float) -> None:
     patterns, stage = SEQUENCES[sequence], scene("strong ambient light")
     frames = images(patterns, stage)

@@ -221,7 +221,11 @@ def test_stated_noise_matches_actual_noise() -> None:
 @pytest.mark.parametrize(
     ("exposures_s", "most"),
     # A short exposure's read noise weighs heavily where there is little light: it may not make the sum worse.
-    [((0.04, 0.08), 0.88), pytest.param((0.02, 0.08), 1.0, marks=pytest.mark.slow), ((0.005, 0.02, 0.08), 1.0)],
+    [
+        pytest.param((0.04, 0.08), 0.88, marks=pytest.mark.slow),
+        pytest.param((0.02, 0.08), 1.0, marks=pytest.mark.slow),
+        ((0.005, 0.02, 0.08), 1.0),
+    ],
 )
 def test_fused_exposures_have_less_noise_than_the_best_of_them(exposures_s: Sequence[float], most: float) -> None:
     dark = NOISY.brightness * 0.08 < 200

@@ -271,7 +271,7 @@ def compressed(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 70])[1], 0), dtype=np.uint8)
 
 
-@pytest.mark.parametrize("seen", [bent, compressed])
+@pytest.mark.parametrize("seen", [bent, pytest.param(compressed, marks=pytest.mark.slow)])
 def test_stripes_are_located_before_the_bits_come_that_only_number_them(
     seen: Callable[[NDArray[np.uint8]], NDArray[np.uint8]],
 ) -> None:
@@ -384,7 +384,14 @@ def test_a_small_thing_in_steady_light_is_refined_as_a_large_one() -> None:
     assert curves.refined
 
 
-@pytest.mark.parametrize(("shift", "offset", "gain"), [(0, 4.0, 1.0), (3, 0.0, 0.7), (7, 3.0, 1.2)])
+@pytest.mark.parametrize(
+    ("shift", "offset", "gain"),
+    [
+        pytest.param(0, 4.0, 1.0, marks=pytest.mark.slow),
+        pytest.param(3, 0.0, 0.7, marks=pytest.mark.slow),
+        (7, 3.0, 1.2),
+    ],
+)
 def test_light_that_changes_in_one_frame_leaves_each_stripe_as_its_own_frame_shows_it(
     shift: int, offset: float, gain: float
 ) -> None:
@@ -470,7 +477,11 @@ def sigma_ratio(curves: CameraCurves, misses: FloatArray) -> float:
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("width_px", "most_px"),
-    [pytest.param(1, 0.3, id="narrow"), pytest.param(4, 0.3, id="half"), pytest.param(4, 0.02, id="half, little")],
+    [
+        pytest.param(1, 0.3, id="narrow"),
+        pytest.param(4, 0.3, id="half"),
+        pytest.param(4, 0.02, id="half, little", marks=pytest.mark.slow),
+    ],
 )
 def test_lines_of_single_frames_beside_the_others_are_in_sigma(width_px: int, most_px: float, seed: int) -> None:
     size, pitch = Size(512, 384), 0.9

@@ -119,7 +119,7 @@ SEQUENCES: dict[str, tuple[tuple[Sine, ...], int | None]] = {
     "three periods": (THREE_PERIODS, None), "2x3": (TWO_PERIODS, None), "micro": (MICRO, None),
 }  # fmt: skip
 """Patterns, and the cell of their Gray code."""
-DEAR = {("three periods", 1.0), ("three periods", 2.2), ("2x3", 1.0), ("micro", 2.2)}
+DEAR = {("three periods", 1.0), ("three periods", 2.2), ("2x3", 1.0), ("2x3", 2.2), ("micro", 2.2)}
 
 
 @pytest.mark.parametrize(

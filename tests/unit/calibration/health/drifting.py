@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -42,6 +43,7 @@ class Bench:
     calibration: Calibration
 
 
+@cache
 def bench(seed: int = 0, *, cameras: int = 1, known_px: float = 0.02) -> Bench:
     """A rig, and a calibration that is off by one draw of its own covariance."""
     names = {"left": left_camera()} if cameras == 1 else {"left": left_camera(), "right": right_camera()}
