@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -127,9 +125,7 @@ def accept(rig_file: Path, asked: AcceptanceOptions, *, output: Path, scripted: 
             else:
                 count = f"{len(plan.steps)} positions, {len(plan.takes)} captures"
                 console.print(f"An acceptance test of {count}.", markup=False)
-                result = measure_positions(
-                    manager, plan, output, place=placed_by_hand(plan, console), again=partial(_print_again, console)
-                )
+                result = measure_positions(manager, plan, output, person=Person(plan, console))
     if as_json:
         typer.echo((output / JSON).read_text(encoding="utf-8"), nl=False)
     else:
@@ -150,22 +146,26 @@ def moving(config: RigConfig, asked: AcceptanceOptions, folder: Path) -> RigConf
     return scripted_config(config, plan, folder)
 
 
-def placed_by_hand(
-    plan: AcceptancePlan, console: Console, *, ask: Callable[[str], str] | None = None
-) -> Callable[[Step], None]:
-    """Tells a person what to place, and waits for Enter; q ends the test (ScanCancelledError)."""
-    names = [step.name for step in plan.steps]
+class Person:
+    """Places the artefacts of a plan, as a console tells."""
 
-    def place(step: Step) -> None:
-        number = names.index(step.name) + 1
-        console.print(Text.assemble((f"\n{number} of {len(names)}  ", "bold"), step.words))
+    def __init__(self, plan: AcceptancePlan, console: Console) -> None:
+        self._names = [step.name for step in plan.steps]
+        self._console = console
+
+    def place(self, step: Step) -> None:
+        """Tell what to place, and wait for Enter; q ends the test (ScanCancelledError)."""
+        number = self._names.index(step.name) + 1
+        self._console.print(Text.assemble((f"\n{number} of {len(self._names)}  ", "bold"), step.words))
         x, y, z = (float(each) for each in step.centre_mm)
-        console.print(f"Its middle about x {x:.0f}, y {y:.0f}, z {z:.0f} mm. Keep it still.", style="dim")
-        if answered(ask or console.input, "[bold]Enter[/bold] measure   [bold]q[/bold] leave > ") == "q":
+        self._console.print(f"Its middle about x {x:.0f}, y {y:.0f}, z {z:.0f} mm. Keep it still.", style="dim")
+        if answered("[bold]Enter[/bold] measure   [bold]q[/bold] leave > ", self._console) == "q":
             message = f"the acceptance test was left before {step.name}; the points of what was measured are kept"
             raise ScanCancelledError(message)
 
-    return place
+    def read(self, step: Step, error: SlrigError) -> None:
+        """Tell why an artefact has to be placed again."""
+        self._console.print(Text(f"{step.name}: {error}", style="red"))
 
 
 def measure_positions(
@@ -174,14 +174,13 @@ def measure_positions(
     output: Path,
     listener: Listener = SILENT,
     *,
-    place: Callable[[Step], None] | None = None,
-    again: Callable[[Step, SlrigError], None] = lambda _step, _error: None,
+    person: Person | None = None,
 ) -> AcceptanceResult:
     """Measure every position of a plan with the rig of a manager, and bring reports and points into `output`. What was
     measured before an error is there, too.
 
-    place : has the artefact of a step placed; None has the rig's positioner do it. again : gets the error where an
-    artefact was not found or a frame contradicted its pattern; the artefact is placed again then.
+    person : places the artefacts, once more where one was not found or a frame contradicted its pattern; None has the
+    rig's positioner do it.
 
     Raises CalibrationError: the rig has none; UnsupportedByDeviceError: it has no positioner, or one that does not know
     a position; NothingToReconstructError, ScanEvidenceError, DeviceError, StorageError, ScanCancelledError.
@@ -190,20 +189,20 @@ def measure_positions(
     test = tests.open(lambda *_: plan).id
     names = [step.name for step in plan.steps]
     try:
-        if place is None:
+        if person is None:
             tests.measure(test, wait=True, scripted=True)
         while (record := tests.get(test).from_first_take()).state is not AcceptanceState.FINISHED:
             step = (record.next_take or plan.takes[-1])[0]
-            if place is not None:
-                place(step)
+            if person is not None:
+                person.place(step)
                 tests.measure(test, wait=True, scripted=False)
             job = manager.store.of(test)[-1]
             ended = followed(manager, job.id, listener.part(names.index(step.name), len(names)))
             if ended.fault is not None:
                 error = error_of(ended.fault)
-                if place is None or not isinstance(error, (NothingToReconstructError, ScanEvidenceError)):
+                if person is None or not isinstance(error, (NothingToReconstructError, ScanEvidenceError)):
                     raise error
-                again(step, error)
+                person.read(step, error)
         return tests.result(test)
     finally:
         measured = tests.folder(test)
@@ -238,7 +237,3 @@ def tell(result: AcceptanceResult, console: Console) -> None:
     if result.scale is not None and result.scale.words is not None:
         console.print(Text(f"{begun(result.scale.words)}.", style=_COLOURS[Decision.FAILS]))
     console.print(Text(f"The rig {result.decision.value}.", style=_COLOURS[result.decision]))
-
-
-def _print_again(console: Console, step: Step, error: SlrigError) -> None:
-    console.print(Text(f"{step.name}: {error}", style="red"))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -378,7 +378,7 @@ def walk(
 
 
 class Walk:
-    """One calibration session, walked through. `ask` prints a prompt and returns what the person typed."""
+    """One calibration session, walked through."""
 
     def __init__(
         self,
@@ -388,7 +388,6 @@ class Walk:
         *,
         exposure_s: float | None = None,
         board_shape: str = "auto",
-        ask: Callable[[str], str] | None = None,
     ) -> None:
         self._client = client
         self._path: str = session["links"]["self"]
@@ -396,7 +395,6 @@ class Walk:
         self._console = console
         self._exposure = {} if exposure_s is None else {"exposure_s": exposure_s}
         self._board_shape = board_shape
-        self._ask = console.input if ask is None else ask
 
     def await_rig(self) -> None:
         """Wait until the rig is open. Raises ServiceError where it cannot be opened."""
@@ -420,7 +418,7 @@ class Walk:
         self._stand()
         while True:
             self._console.print()
-            answer = answered(self._ask, f"{_KEYS} > ")
+            answer = answered(f"{_KEYS} > ", self._console)
             if answer == "q":
                 break
             try:
@@ -551,7 +549,7 @@ class Walk:
     def _offer_activation(self) -> bool:
         """Ask what to do with a solved calibration; True when the walk is over."""
         keys = "[bold]a[/bold] have scans use it   [bold]Enter[/bold] shoot more   [bold]q[/bold] leave > "
-        answer = answered(self._ask, keys)
+        answer = answered(keys, self._console)
         if answer == "a":
             self._activate()
         elif answer == "q":

@@ -6,7 +6,7 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TextIO
 
@@ -145,10 +145,10 @@ def counted(count: int, what: str) -> str:
     return f"{count} {what}{'s' * (count != 1)}"
 
 
-def answered(ask: Callable[[str], str], prompt: str) -> str:
-    """What a person typed, in lower case; "q" for the end of input and "quit"."""
+def answered(prompt: str, console: Console | None = None) -> str:
+    """What a person typed, in lower case; "q" for the end of input and "quit". console : prints the prompt."""
     try:
-        answer = ask(prompt).strip().lower()
+        answer = (input(prompt) if console is None else console.input(prompt)).strip().lower()
     except EOFError:
         return "q"
     return "q" if answer == "quit" else answer

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -41,14 +41,11 @@ def views_here(
     manual: bool,
     axis: StatedAxis | None,
     found: StartingPoses | None = None,
-    ask: Callable[[str], str] = input,
 ) -> tuple[dict[str, Path], StartingPoses, list[str]]:
     """Shoot the views that `output` lacks, each into view-N with its frames in bundle-N. Return the meshes by name,
     where they start from, and words for views that failed. Ctrl-C leaves what was shot.
 
-    axis : None for the turntable's own. found : unknown, or by markers: no
-    angle and no axis is needed. ask : prints a prompt
-    and returns what the person typed.
+    axis : None for the turntable's own. found : unknown, or by markers: no angle and no axis is needed.
 
     Raises
     ------
@@ -77,7 +74,7 @@ def views_here(
             )
         for number in [number for number, mesh in meshes.items() if not mesh.is_file()]:
             prompt = f"turn the object by about {shoot.step_deg:g}°, to {shoot.angle_deg(number):g}° in all,"
-            while not manual or number == 1 or answered(ask, f"{prompt} then press Enter (q: no more) > ") != "q":
+            while not manual or number == 1 or answered(f"{prompt} then press Enter (q: no more) > ") != "q":
                 try:
                     _shot(rig, shoot.view(number, model_id, utc_now()), output, number)
                     break
@@ -125,7 +122,7 @@ def _shot(rig: Rig, plan: ScanPlan, output: Path, number: int) -> None:
         reconstruct_bundle(bundle, folder, Listener(report=display), plan=plan.reconstruction)
 
 
-def views_there(client: Client, request: Mapping[str, Any], output: Path, *, ask: Callable[[str], str] = input) -> None:
+def views_there(client: Client, request: Mapping[str, Any], output: Path) -> None:
     """Have a service shoot the views and make the model, and fetch its files into `output`. Ctrl-C cancels; scans that
     were made stay with the service.
 
@@ -144,7 +141,7 @@ def views_there(client: Client, request: Mapping[str, Any], output: Path, *, ask
                             turn = event.detail
                             break
             if turn:
-                answer = answered(ask, f"{turn}, then press Enter (a: shoot the last one again, q: no more) > ")
+                answer = answered(f"{turn}, then press Enter (a: shoot the last one again, q: no more) > ")
                 _ = (
                     client.models.combine(here)
                     if answer == "q"

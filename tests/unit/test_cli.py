@@ -31,7 +31,7 @@ from slrig.api.schemas import ScanRequest
 from slrig.bundle.options import read_region
 from slrig.calibration.artefacts import Decision
 from slrig.cli import accept as accepting
-from slrig.cli.accept import measure_positions, moving, placed_by_hand, plan_for
+from slrig.cli.accept import Person, measure_positions, moving, plan_for
 from slrig.cli.commands import INTERRUPTED, app
 from slrig.cli.display import ProgressDisplay, print_json, print_table
 from slrig.cli.options import AcceptanceOptions, ServiceOptions
@@ -568,22 +568,23 @@ def test_a_rig_that_is_not_rendered_cannot_be_scripted(tmp_path: Path, plan: Acc
         scripted_config(replace(config, head=None), plan, tmp_path)
 
 
-def test_person_reads_each_position_and_may_leave(plan: AcceptancePlan) -> None:
+def test_person_reads_each_position_and_may_leave(plan: AcceptancePlan, monkeypatch: pytest.MonkeyPatch) -> None:
     shown = io.StringIO()
     answers = iter(["", "q"])
 
-    def ask(_: str) -> str:
+    def typed() -> str:
         if (answer := next(answers, None)) is None:
             raise EOFError
         return answer
 
-    place = placed_by_hand(plan, Console(file=shown, width=120), ask=ask)
-    place(plan.steps[0])
+    monkeypatch.setattr("builtins.input", typed)
+    person = Person(plan, Console(file=shown, width=120))
+    person.place(plan.steps[0])
     assert "1 of 23" in shown.getvalue()
     assert "Put the sphere in the middle of the volume." in shown.getvalue()
     for _ in ("q", "end of input"):
         with pytest.raises(ScanCancelledError, match="left before sphere-2"):
-            place(plan.steps[1])
+            person.place(plan.steps[1])
 
 
 @pytest.mark.slow

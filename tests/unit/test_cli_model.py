@@ -348,15 +348,16 @@ class Asked:
         self.fetch: Callable[[str, Path], None] = lambda link, path: self.fetched.append((link, path))
 
 
-def test_service_shoots_what_the_person_answers(tmp_path: Path) -> None:
+def test_service_shoots_what_the_person_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     client, answers = Asked(), iter(["a", "q"])
-    model_shoot.views_there(client, {"views": 3}, tmp_path / "out", ask=lambda _: next(answers))  # type: ignore[arg-type]
+    monkeypatch.setattr("builtins.input", lambda _: next(answers))
+    model_shoot.views_there(client, {"views": 3}, tmp_path / "out")  # type: ignore[arg-type]
     wait = {"if_busy": "queue"}
     assert client.models.asked == [{"views": 3, **wait}, {"again": True, **wait}, "combine"]
     assert client.fetched == [("/model/m/model.ply", tmp_path / "out" / "model.ply")]
     failed, answers = Asked("failed"), iter(["", ""])
     with pytest.raises(ServiceError, match="Model m failed: too few views"):
-        model_shoot.views_there(failed, {}, tmp_path, ask=lambda _: next(answers))  # type: ignore[arg-type]
+        model_shoot.views_there(failed, {}, tmp_path)  # type: ignore[arg-type]
     assert failed.models.asked == [wait, {"again": False, **wait}, {"again": False, **wait}]
 
 

@@ -34,7 +34,7 @@ from slrig.accept.plan import (
 from slrig.accept.report import document, report_html
 from slrig.accept.store import AcceptanceRecord, AcceptanceState, record_from_json, record_json
 from slrig.calibration.artefacts import Decision
-from slrig.cli.accept import measure_positions, tell
+from slrig.cli.accept import Person, measure_positions, tell
 from slrig.devices import Rig
 from slrig.errors import (
     CalibrationError,
@@ -334,10 +334,14 @@ def test_an_artefact_that_was_not_found_is_placed_again(run: Callable[..., Accep
         forgotten = step.name == "sphere-2" and placed.count("sphere-2") == 1
         return scan_of(step_of(Artefact.PLANE)) if forgotten else scan_of(step)
 
-    def again(step: Step, error: SlrigError) -> None:
-        refused.append(f"{step.name} {error}")
+    class Hand(Person):
+        def place(self, step: Step) -> None:
+            placed.append(step.name)
 
-    result = run(plan, scan=scan, place=lambda step: placed.append(step.name), again=again)
+        def read(self, step: Step, error: SlrigError) -> None:
+            refused.append(f"{step.name} {error}")
+
+    result = run(plan, scan=scan, person=Hand(plan, Console()))
     assert placed == ["sphere-1", "sphere-2", "sphere-2"]
     assert result.complete
     assert len(refused) == 1
