@@ -100,7 +100,8 @@ def advise_exposure(
 
     limits_s : shortest and longest exposure of the camera.
     """
-    longest_s = min(light.longest_s, limits_s[1])
+    longest_s = min(light.longest_s, light.taken_s, limits_s[1])
+    which = "that does not saturate" if longest_s == light.longest_s else "that the camera takes"
     shortest_s = max(min(light.shortest_s, longest_s), limits_s[0])
     usable_s = (shortest_s, longest_s)
     name, period_s = _period_to_average(refresh_hz, flickers)
@@ -114,10 +115,10 @@ def advise_exposure(
     if is_usable and is_synchronous and flicker_share(own_s) <= _NEGLIGIBLE_FLICKER:
         return ExposureAdvice(own_s, "unchanged: it exposes well", usable_s)
     if period_s is None:
-        return ExposureAdvice(longest_s, "the longest that does not saturate", usable_s)
+        return ExposureAdvice(longest_s, f"the longest {which}", usable_s)
     counts = [k for k in range(1, _MAX_PERIODS + 1) if shortest_s <= k * period_s <= 1.001 * longest_s]
     if not counts:
-        reason = f"the longest that does not saturate, less than {name} ({format_ms(period_s)})"
+        reason = f"the longest {which}, less than {name} ({format_ms(period_s)})"
         return ExposureAdvice(longest_s, reason, usable_s)
     steady = [k for k in counts if flicker_share(k * period_s) <= _NEGLIGIBLE_FLICKER]
     count = steady[-1] if steady else min(counts, key=lambda k: flicker_share(k * period_s))

@@ -10,7 +10,14 @@ from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 
-from slrig.capture import DEFAULT_SEARCH_S, CameraLatency, LatencyMeasurement, choose_triggers, earliest_change_s
+from slrig.capture import (
+    DEFAULT_SEARCH_S,
+    CameraLatency,
+    LatencyMeasurement,
+    choose_triggers,
+    differs_from_request,
+    earliest_change_s,
+)
 from slrig.devices import (
     CameraInfo,
     FoundDevice,
@@ -29,11 +36,19 @@ from slrig.doctor.advice import (
     check_refresh_multiple,
     is_whole_periods,
 )
-from slrig.doctor.image import check_calibrated, check_focus, check_sharpening, measure_response
+from slrig.doctor.image import (
+    check_calibrated,
+    check_exposures,
+    check_focus,
+    check_sharpening,
+    check_steady,
+    measure_response,
+)
 from slrig.doctor.light import (
     CameraSession,
     Finding,
     LightMeasurement,
+    LocatedPicture,
     Severity,
     camera_label,
     fault,
@@ -186,6 +201,8 @@ class _DoctorRun:
         self.is_polarity_unknown = False
         self._advice: dict[str, ExposureAdvice] = {}
         self._blurs_px: list[float] = []
+        self._exponents: dict[str, float | None] = {}
+        self._pictures: dict[str, LocatedPicture] = {}
 
     def run(self) -> None:
         self.findings += _describe_devices(self.rig, self.displays)
@@ -193,10 +210,12 @@ class _DoctorRun:
             ("patterns", self._choose_sequence),
             ("light", self._measure_lights),
             ("current", self._check_current),
+            ("exposures", self._check_exposures),
             ("timing", self._measure_timing),
             ("picture and focus", self._check_pictures),
             ("response", self._measure_response),
             ("flicker", self._measure_flicker),
+            ("steadiness", self._check_steady),
             ("exposure", self._advise_exposures),
         ]
         if self.rig.projector.info.plays and all(
@@ -278,6 +297,12 @@ class _DoctorRun:
             finding = find_current_direction(self._open_session(best_lit.name), self.sequence, best_lit)
             self.findings.append(finding)
 
+    def _check_exposures(self) -> None:
+        for name, light in self.lights.items():
+            session = self._open_session(name)
+            self.lights[name], self._exponents[name], findings = check_exposures(session, self.sequence, light)
+            self.findings += findings
+
     def _measure_timing(self) -> None:
         if not self.lights:
             return
@@ -321,6 +346,11 @@ class _DoctorRun:
             self._blurs_px.append(blur_px)
             self.findings += findings
             self.findings += check_sharpening(name, light, picture, self.rig.calibration)
+            self._pictures[name] = picture
+
+    def _check_steady(self) -> None:
+        for name, picture in self._pictures.items():
+            self.findings += check_steady(self._open_session(name), self.sequence, self.lights[name], picture)
 
     def _best_lit(self) -> LightMeasurement | None:
         """Measurement by the camera whose image the projector lights most: it examines the projector."""
@@ -328,7 +358,8 @@ class _DoctorRun:
 
     def _measure_response(self) -> None:
         if (best_lit := self._best_lit()) is not None:
-            self.curve, findings = measure_response(self._open_session(best_lit.name), best_lit)
+            session = self._open_session(best_lit.name)
+            self.curve, findings = measure_response(session, best_lit, self._exponents[best_lit.name])
             self.findings += findings
 
     def _measure_flicker(self) -> None:
@@ -345,8 +376,16 @@ class _DoctorRun:
     def _advise_exposures(self) -> None:
         for name, light in self.lights.items():
             self.findings += check_refresh_multiple(light, self.refresh_hz)
-            limits_s = self.rig.cameras[name].info.exposure_range_s
-            self._advice[name] = advise_exposure(light, limits_s, refresh_hz=self.refresh_hz, flickers=self.flickers)
+            camera = self.rig.cameras[name]
+            limits_s = camera.info.exposure_range_s
+            advice = advise_exposure(light, limits_s, refresh_hz=self.refresh_hz, flickers=self.flickers)
+            camera.disarm()
+            settings = replace(self.rig.settings[name], exposure_s=advice.exposure_s)
+            taken_s = camera.configure(settings).exposure_s
+            if differs_from_request(taken_s, advice.exposure_s):
+                reason = f"{advice.reason}; of {format_ms(advice.exposure_s)} the camera takes this"
+                advice = replace(advice, exposure_s=taken_s, reason=reason)
+            self._advice[name] = advice
 
     def _measure_pulses(self) -> None:
         """Measure with the exposures that were advised, without what the rig file says of the period."""

@@ -19,6 +19,7 @@ from slrig.doctor.light import (
     LocatedPicture,
     camera_label,
     fault,
+    format_ms,
     note,
     ok,
 )
@@ -44,6 +45,8 @@ _MIN_BAR_PIXELS = 200
 _NOTE_CONTRAST, _FAULT_CONTRAST = 0.5, 0.25
 _CAMERA_SHARE, _PROJECTOR_SHARE = 0.6, 0.35
 _BORDER_PX = 12
+_RESOLVED = 0.3  # square wave of bars over white less black
+_MAX_CHANGE = 0.15  # of bars that are shown again, over their contrast
 
 _MIN_CERTAIN = 0.5  # share of the pixels by which a bit can be read
 _MAX_PAIRS = 20_000
@@ -60,7 +63,11 @@ _CAMERA_EXPONENTS = (0.3, 3.0)  # of a camera that has a tone curve
 _MAX_KNEE = 10.0
 _MAX_REVERSAL = 0.03
 _ALL_WHITE = 0.9
-_EXPOSURE_SHARES = (1.0, 0.5, 0.25)
+_EXPOSURE_SHARES, _USUAL_SHARES = (1.0, 0.5, 0.25, 1 / 16, 1 / 64, 1 / 256), 3
+_PLATEAU_POWER, _NO_POWER = 0.7, 0.15  # of the values' growth with the exposure, over the greatest, and at least
+_DARKER, _PLATEAU_SHARE = 0.8, 0.97  # of the brightness at the longest exposure
+_MIN_PLATEAU = 1.25  # a curve that bends most still grows by more than a plateau within such a factor
+_BISECTIONS = 5
 
 
 # ---- Focus
@@ -128,12 +135,47 @@ def _bar_contrasts(
         extent_px = float(high - low) + picture.cell_px[axis]
     contrasts = []
     for each in picture.bars:
-        bit = each.pattern
-        period_px = float(2 * bit.cell_px * edge_indices(bit.bit, bit.bits)[1])
+        bit, period_px = each.pattern, _period_px(each.pattern)
         if bit.axis is axis and (period_px * _WHOLE_PERIODS <= extent_px or bit.bit == bit.bits - 1):
             signal, white = each.difference[usable].astype(np.float64), light.levels.contrast[usable]
             contrasts.append(bar_contrast(signal, white, noise_dn=light.levels.noise_dn, period_px=period_px))
     return contrasts
+
+
+def _period_px(bit: Gray) -> float:
+    return float(2 * bit.cell_px * edge_indices(bit.bit, bit.bits)[1])
+
+
+def check_steady(
+    session: CameraSession, sequence: PatternSequence, light: LightMeasurement, picture: LocatedPicture
+) -> list[Finding]:
+    """Show the finest bars that the camera resolves once more: a lens that moves shows, whatever its driver answers."""
+    levels, usable = light.levels, light.levels.usable
+    noise = 4 * levels.noise_dn**2
+    powers = [float(np.mean(each.difference[usable] ** 2)) for each in picture.bars]
+    white = float(np.mean(levels.contrast[usable] ** 2))
+    resolved = [each for each, power in zip(picture.bars, powers, strict=True) if power - noise / 2 > _RESOLVED * white]
+    if not resolved or np.count_nonzero(usable) < _MIN_BAR_PIXELS:
+        return []
+    bars = min(resolved, key=lambda each: _period_px(each.pattern))
+    was, subject = bars.difference[usable], camera_label(session.name)
+    for _ in range(2):
+        with session.arm(sequence, light.exposure_s, 2):
+            lit, dark = (
+                session.capture_frames(sequence.patterns.index(each))[0].image[usable].astype(np.float32)
+                for each in (bars.pattern, bars.pattern.inverse)
+            )
+        change = math.sqrt(max(float(np.mean((lit - dark - was) ** 2)) - noise, 0) / float(np.mean(was**2)))
+        shown = f"bars of {_period_px(bars.pattern):g} px"
+        message = f"{shown} differ by {change:.0%} of their contrast from the same bars before"
+        # A picture that missed its refresh is shown again.
+        if change < _MAX_CHANGE:
+            return [ok("picture.steady", subject, message)]
+    remedy = (
+        "if its lens moves by itself, though autofocus is switched off or its focus is set: use another camera, or fix "
+        "the lens; switch image stabilisation off; if it is neither, see that camera, projector and object stand still"
+    )
+    return [fault("picture.steady", subject, f"{message}, earlier in this examination", remedy)]
 
 
 def _object_edge_blur(sequence: PatternSequence, light: LightMeasurement, picture: LocatedPicture) -> EdgeBlur | None:
@@ -296,8 +338,13 @@ def grey_fields(size: Size) -> tuple[FloatArray, PatternSequence]:
     return values, PatternSequence(size, tuple(patterns), profiles)
 
 
-def measure_response(session: CameraSession, light: LightMeasurement) -> tuple[ResponseCurve | None, list[Finding]]:
-    """Show even greys, and return their curve, None if the projector cannot show greys, and the findings."""
+def measure_response(
+    session: CameraSession, light: LightMeasurement, exponent: float | None
+) -> tuple[ResponseCurve | None, list[Finding]]:
+    """Show even greys, and return their curve, None if the projector cannot show greys, and the findings.
+
+    exponent : by which the camera's values grow with the exposure; None if unknown.
+    """
     values, sequence = grey_fields(session.projector.info.size)
     try:
         session.projector.load(sequence)
@@ -306,8 +353,6 @@ def measure_response(session: CameraSession, light: LightMeasurement) -> tuple[R
     except DeviceError as error:
         message = f"it shows no greys, so nothing can bend its black and white: {error}"
         return None, [ok("response.binary", "projector", message)]
-    exponent = _camera_exponent(session, light, sequence)
-    camera = [] if exponent is None else [_check_camera_linearity(session.name, exponent)]
     # What the camera makes of light is not the projector's fault: bent darks look like a limited range. One whose
     # values do not follow the exposure has no curve that could be undone.
     least, most = _CAMERA_EXPONENTS
@@ -315,9 +360,9 @@ def measure_response(session: CameraSession, light: LightMeasurement) -> tuple[R
     shares = _measure_greys(session, light, sequence, exponent if exponent is not None and is_curve else 1.0)
     if shares[1] > _ALL_WHITE:
         message = "it shows every grey as white: nothing bends black and white"
-        return None, [ok("response.binary", "projector", message), *camera]
+        return None, [ok("response.binary", "projector", message)]
     curve = fit_response_curve([float(value) for value in values], [float(share) for share in shares])
-    return curve, [*_check_projector_response(curve), *camera]
+    return curve, _check_projector_response(curve)
 
 
 def _measure_greys(
@@ -372,26 +417,67 @@ def _check_projector_response(curve: ResponseCurve) -> list[Finding]:
     return findings or [ok("response.straight", "projector", proportional)]
 
 
-def _camera_exponent(session: CameraSession, light: LightMeasurement, sequence: PatternSequence) -> float | None:
-    """The power by which a camera's values grow with the exposure, a test of the camera alone; None if unknown."""
-    exposures_s: list[float] = []
-    contrast_dn: list[float] = []
-    usable = light.levels.usable
-    for share in _EXPOSURE_SHARES:
-        with session.arm(sequence, share * light.exposure_s, 2 * _GREY_FRAMES):
+# ---- Exposures of the camera
+
+
+def check_exposures(
+    session: CameraSession, sequence: PatternSequence, light: LightMeasurement
+) -> tuple[LightMeasurement, float | None, list[Finding]]:
+    """Compare a camera's values at several exposures: its driver may answer for an exposure that it never took.
+
+    Return the light at the exposures that the camera really takes, the power by which its values grow with them, None
+    if unknown, and the findings. sequence : with white and black.
+    """
+
+    def contrast_dn(wanted_s: float) -> float:
+        with session.arm(sequence, wanted_s, 2 * _GREY_FRAMES):
             dark, bright = (
-                np.mean([frame.image[usable].mean() for frame in session.capture_frames(index, _GREY_FRAMES)])
-                for index in (0, len(sequence) - 1)
+                np.mean(
+                    [each.image[light.levels.usable].mean() for each in session.capture_frames(index, _GREY_FRAMES)]
+                )
+                for index in map(sequence.patterns.index, (Black(), White()))
             )
-        exposures_s.append(session.exposure_s)
-        contrast_dn.append(float(bright - dark))
-    if min(contrast_dn) <= 0 or exposures_s[-1] > 0.75 * exposures_s[0]:
-        return None
-    return fit_camera_exponent(exposures_s, contrast_dn)
+        return float(bright - dark)
+
+    measured: dict[float, float] = {}
+    for number, share in enumerate(_EXPOSURE_SHARES):
+        level_dn = contrast_dn(share * light.exposure_s)
+        measured[session.exposure_s] = level_dn
+        if number >= _USUAL_SHARES - 1 and level_dn < _DARKER * next(iter(measured.values())):
+            break
+    exposures_s, levels_dn = list(measured), np.array(list(measured.values()))
+    if levels_dn.min() <= 0 or exposures_s[-1] > 0.75 * exposures_s[0]:
+        return light, None, []
+    subject, taken_s = camera_label(session.name), exposures_s[0]
+    powers = np.diff(np.log(levels_dn)) / np.diff(np.log(exposures_s))
+    if powers.max() < _NO_POWER:
+        message = f"its picture is as bright at {format_ms(exposures_s[-1])} as at {format_ms(taken_s)}"
+        remedy = (
+            "its exposure is its own, whatever its driver answers: switch automatic exposure and gain off with the "
+            "maker's program, or use another camera; frames that its automatic changes contradict one another"
+        )
+        return light, None, [note("exposure.ignored", subject, message, remedy)]
+    if powers[0] < _PLATEAU_POWER * powers.max():
+        plateau_dn = _PLATEAU_SHARE * levels_dn[0]
+        followed_s = max(each for each, level_dn in measured.items() if level_dn < plateau_dn)
+        for _ in range(_BISECTIONS):
+            is_taken = contrast_dn(math.sqrt(followed_s * taken_s)) >= plateau_dn
+            followed_s, taken_s = (followed_s, session.exposure_s) if is_taken else (session.exposure_s, taken_s)
+    if exposures_s[0] < _MIN_PLATEAU * taken_s:
+        exponent = fit_camera_exponent(exposures_s, levels_dn.tolist())
+        return light, exponent, [_check_camera_linearity(subject, exponent)]
+    message = (
+        f"at {format_ms(exposures_s[0])} its picture is as bright as at {format_ms(taken_s)}: it exposes no longer, "
+        "whatever its driver answers"
+    )
+    remedy = (
+        f"write an exposure_s of {float(f'{taken_s:.2g}'):g} or less; for more light open the lens's aperture, bring "
+        "the projector nearer, or raise the gain"
+    )
+    return light.limited(taken_s), None, [note("exposure.clamped", subject, message, remedy)]
 
 
-def _check_camera_linearity(name: str, exponent: float) -> Finding:
-    subject = camera_label(name)
+def _check_camera_linearity(subject: str, exponent: float) -> Finding:
     if abs(exponent - 1) <= _EXPONENT_TOLERANCE:
         message = f"its values grow in proportion to the exposure (power {exponent:.2f})"
         return ok("response.camera", subject, message)

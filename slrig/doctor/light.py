@@ -59,6 +59,7 @@ _MIN_STRUCTURE = 0.6
 _MAX_SEARCH_EXPOSURE_S = 1.0
 _SEARCH_FACTOR = 8.0
 _MAX_EXPOSURES_TRIED = 8
+_MIN_GROWTH = 1.02  # of the brightness by an exposure that is longer
 _WELL_EXPOSED = (0.45, 0.97)
 _NOTE_SATURATED_SHARE, _FAULT_SATURATED_SHARE = 0.01, 0.05
 _SHORT_EXPOSURE_SHARE = 0.25
@@ -248,7 +249,8 @@ class LightMeasurement:
 
     own_levels : at the rig's own exposure, own_exposure_s. levels : at exposure_s, which suits the light.
     shortest_s, longest_s : limits of the exposure by noise and by saturation. skew_s : of the shutter, and
-    stamp_error_s : of the time stamps, both as the driver states them.
+    stamp_error_s : of the time stamps, both as the driver states them. taken_s : the longest exposure that the camera
+    takes, whatever it declares.
     """
 
     name: str
@@ -260,6 +262,18 @@ class LightMeasurement:
     longest_s: float
     skew_s: float
     stamp_error_s: float = 0.0
+    taken_s: float = math.inf
+
+    def limited(self, taken_s: float) -> LightMeasurement:
+        """Return the measurement of a camera that took no longer exposure than this."""
+        exposure_s = min(self.exposure_s, taken_s)
+        return replace(
+            self,
+            exposure_s=exposure_s,
+            shortest_s=self.levels.shortest_exposure_s(exposure_s),
+            longest_s=self.levels.longest_exposure_s(exposure_s),
+            taken_s=taken_s,
+        )
 
 
 def measure_light(
@@ -281,11 +295,17 @@ def measure_light(
         is_dark_to_the_end = not _is_visible(levels) and next_s > max(_MAX_SEARCH_EXPOSURE_S, own_s)
         if abs(next_s / exposure_s - 1) < 0.02 or is_dark_to_the_end:
             break
+        before = levels
         try:
             levels, frame = _measure_levels(session, sequence, next_s)
         except UnsupportedByDeviceError:
             # A declared range is a bound: between this exposure and the last one is where it ends.
             session.limit_exposure(exposure_s, next_s)
+            break
+        is_brighter = levels.bright_dn >= _MIN_GROWTH * before.bright_dn
+        if session.exposure_s > exposure_s and _is_visible(before) and not is_brighter:
+            # It takes no longer one, whatever its driver answers.
+            levels = before
             break
         exposure_s = session.exposure_s
     if not _is_visible(levels):

@@ -80,7 +80,7 @@ Opens = Callable[[ExitStack, Path], Disturbed]
 
 def v4l2(leaving: ExitStack, _: Path, *, stamp: str) -> Disturbed:
     faked = Faked(
-        stamp=stamp, readout_s=0.0015, bands=4, jitter_s=0.001, lost=0.1, corrupt=0.05, noise_when_corrupt=False
+        stamp=stamp, readout_s=0.0015, rolling=True, jitter_s=0.001, lost=0.1, corrupt=0.05, noise_when_corrupt=False
     )
     device = leaving.enter_context(v4l2_bench.VirtualDevice(v4l2_bench.virtually(noise_dn=1.0), faked))
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator, Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +19,22 @@ REFERENCE_EXPOSURE_S = 0.01
 
 _REMEMBERED = 500
 """Changes of light that are kept."""
+
+
+def exposed_shares(
+    changes: Sequence[tuple[int, Pixels]], t_start_ns: int, t_end_ns: int, *, rows: int, readout_ns: int
+) -> Iterator[tuple[NDArray[np.float64], Pixels]]:
+    """Each light of an exposure, and its share of it in each row, (rows, 1). The last row begins `readout_ns` late."""
+    start_ns = t_start_ns + np.linspace(0, readout_ns, rows)[:, None]
+    span_ns = max(t_end_ns - t_start_ns, 1)
+    until_ns = np.asarray(start_ns + span_ns)
+    for at_ns, profile in reversed(changes):
+        share = (until_ns - np.maximum(at_ns, start_ns)) / span_ns
+        if (share > 0).any():
+            yield np.maximum(share, 0), profile
+        if at_ns <= t_start_ns:
+            return
+        until_ns = np.minimum(until_ns, at_ns)
 
 
 class Stage:
@@ -60,17 +78,22 @@ class Stage:
             self.changes.append((at_ns, self.dark if profile is None else profile))
             return at_ns
 
-    def exposed(self, t_start_ns: int, t_end_ns: int, *, gain: float = 1.0) -> Pixels:
-        """What the sensor read out after an exposure, (H, W), with the scene's noise."""
+    def exposed(
+        self, t_start_ns: int, t_end_ns: int, *, gain: float = 1.0, readout_ns: int = 0, defocus_px: float = 0.0
+    ) -> Pixels:
+        """What the sensor read out after an exposure, (H, W), with the scene's noise.
+
+        The times are those of the first row; a rolling shutter's last one comes `readout_ns` later. defocus_px : the
+        lens's, a standard deviation.
+        """
         with self._lock:
             changes = list(self.changes)
         exposure_s = (t_end_ns - t_start_ns) / 1e9
         seen = np.zeros(self.format.size.shape)
-        for index, (at_ns, profile) in enumerate(changes):
-            until_ns = changes[index + 1][0] if index + 1 < len(changes) else t_end_ns
-            share = (min(until_ns, t_end_ns) - max(at_ns, t_start_ns)) / max(t_end_ns - t_start_ns, 1)
-            if share > 0:
-                seen += share * self._seen(profile)
+        for share, profile in exposed_shares(changes, t_start_ns, t_end_ns, rows=len(seen), readout_ns=readout_ns):
+            seen += share * self._seen(profile)
+        if defocus_px > 0:
+            seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), defocus_px), np.float64)
         with self._lock:
             noise = self.scene.noise_dn * self._rng.standard_normal(seen.shape)
         return self._whole(self._level(seen, exposure_s * gain) + noise)

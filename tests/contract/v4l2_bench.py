@@ -87,10 +87,11 @@ class Faked:
     """A fake camera. Times in seconds; `stamp`, `lost` and their like as in `v4l2_kernel`.
 
     rates_of : times per frame of one format and size ("YUYV 160 x 120"), in place of `rates`. line_s : what a unit of
-    its exposure in lines lasts. first_frame_s : from the start of the stream to its first frame. forgets_at_start : its
-    exposure is the default then, whatever its driver says. A control may have `kind`, `flags`, `insists_on`, `takes`
-    (the only values that it does not refuse), `really_at_most` (of an exposure, whatever its driver says), `stalls`
-    (the requests "describe", "get", "set" that it answers with `errno`), and `long`, a 64-bit value.
+    its exposure in lines lasts. first_frame_s : from the start of the stream to its first frame. A control may have
+    `kind`, `flags`, `insists_on`, `takes` (the only values that it does not refuse), `stalls` (the requests
+    "describe", "get", "set" that it answers with `errno`), and `long`, a 64-bit value. Whatever its driver says, its
+    value may be `really_at_most` so much, be the default from the start of the stream until it is set again
+    (`forgets_at_start`), and move by up to so many units (`creeps`).
     """
 
     formats: Mapping[str, list[tuple[int, int]]] = field(
@@ -103,7 +104,8 @@ class Faked:
     line_s: float = 0.0
     stamp: str = "start"
     readout_s: float = 0.0
-    bands: int = 1
+    rolling: bool = False
+    sharp_at: int = 0
     jitter_s: float = 0.0
     lag_frames: int = 3
     lost: float = 0.0
@@ -114,7 +116,6 @@ class Faked:
     stretches: bool = True
     padding_bytes: int = 0
     first_frame_s: float = 0.0
-    forgets_at_start: bool = False
     seed: int = 0
     nodes: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: {"video0": {}})
 
@@ -122,7 +123,7 @@ class Faked:
         keys = (
             *("rates_of", "driver", "line_s"),
             *("formats", "rates", "controls", "stamp", "readout_s", "jitter_s", "lag_frames", "lost", "corrupt"),
-            *("flags_corrupt", "tells_rate", "stretches", "padding_bytes", "seed", "first_frame_s", "forgets_at_start"),
+            *("flags_corrupt", "tells_rate", "stretches", "padding_bytes", "seed", "first_frame_s"),
         )
         most = max(width * height for sizes in self.formats.values() for width, height in sizes)
         usual = {"card": "Bench camera", "bus": "usb-0000:00:14.0-2", "capabilities": 0x04200001}
@@ -189,7 +190,11 @@ class VirtualDevice:
     def __init__(self, stage: Stage, faked: Faked) -> None:
         self.stage, self.clock = stage, stage.clock
         self.sensor = Sensor(
-            stage, readout_s=faked.readout_s, bands=faked.bands, noise_when_corrupt=faked.noise_when_corrupt
+            stage,
+            readout_s=faked.readout_s,
+            rolling=faked.rolling,
+            sharp_at=faked.sharp_at,
+            noise_when_corrupt=faked.noise_when_corrupt,
         )
         config = faked.config(Path(), Path())
         own = config["nodes"]["video0"]

@@ -32,13 +32,16 @@ SIZES = {
     )
 }
 
-EXPOSURE_AUTO, EXPOSURE_ABSOLUTE, GAIN = 0x009A0901, 0x009A0902, 0x00980913
+EXPOSURE_AUTO, EXPOSURE_ABSOLUTE, FOCUS, GAIN = 0x009A0901, 0x009A0902, 0x009A090A, 0x00980913
 EXPOSURE_LINES = 0x00980911
 READ_ONLY = 4
 PAGE = 4096
 MOST_BUFFERS = 32
 LONGEST_WAIT_NS = 5_000_000
 """A plain file is always ready to be polled, so an empty answer is held back a while, as `poll` would have waited."""
+
+CREEPS_S = 20.0
+"""A control that creeps is away from its value by most of its range after so long, and back after as long again."""
 
 STAMP_FLAGS = {"start": 0x12000, "first packet": 0x12000, "end": 0x2000, "none": 0, "other clock": 0x12000}
 
@@ -128,6 +131,7 @@ class Device:
     buffers: int = 0
     room_bytes: int = 0
     streaming: bool = False
+    forgotten: set[int] = field(default_factory=set)
     queued: deque[tuple[int, int]] = field(default_factory=deque)
     filled: deque[tuple[int, Shot]] = field(default_factory=deque)
 
@@ -292,10 +296,9 @@ class Device:
             raise Refused(errno.EBUSY)
         if self.has_fault("no bandwidth"):
             raise Refused(errno.ENOSPC)
+        # What they were set to stays in the driver's memory.
+        self.forgotten = {number for number, each in self.controls.items() if each.get("forgets_at_start")}
         exposure_ns = self.exposure_ns()
-        if self.config["forgets_at_start"]:
-            # What it was set to stays in the driver's memory.
-            exposure_ns = self.controls[EXPOSURE_ABSOLUTE]["default"] * 100_000
         period_ns = round(self.rate[0] / self.rate[1] * 1e9)
         self.sensor.start(period_ns, exposure_ns or period_ns)
         self.streaming = True
@@ -303,8 +306,15 @@ class Device:
     def exposure_ns(self) -> int:
         if EXPOSURE_LINES in self.values:
             return int(self.values[EXPOSURE_LINES] * self.config["line_s"] * 1e9 + 0.5)
-        units = self.values.get(EXPOSURE_ABSOLUTE, 0)
-        return int(min(units, self.controls.get(EXPOSURE_ABSOLUTE, {}).get("really_at_most", units)) * 100_000)
+        return self.really(EXPOSURE_ABSOLUTE) * 100_000
+
+    def really(self, number: int) -> int:
+        """What the camera uses of a control, whatever its driver says."""
+        control = self.controls.get(number, {"default": 0})
+        value = control["default"] if number in self.forgotten else self.values.get(number, 0)
+        creeps_s = self.now_ns() / 1e9 % (2 * CREEPS_S)
+        value += control.get("creeps", 0) * abs(creeps_s / CREEPS_S - 1)
+        return round(min(value, control.get("really_at_most", value)))
 
     def stop(self, file: object) -> None:
         if self.owner is file:
@@ -337,6 +347,7 @@ class Device:
                 "start_ns": shot.start_ns,
                 "exposure_ns": shot.exposure_ns,
                 "gain": self.values.get(GAIN, 0),
+                "focus": self.really(FOCUS),
                 "corrupt": shot.corrupt,
                 "code": self.code,
                 "row_bytes": self.row_bytes(),
@@ -411,6 +422,7 @@ class Device:
             raise Refused(errno.ERANGE)
         value = control.get("insists_on", value)
         self.values[number] = min(max(value, control["minimum"]), control["maximum"])
+        self.forgotten.discard(number)
         self.was_set(control["name"], self.values[number])
         if self.streaming and number in (EXPOSURE_ABSOLUTE, EXPOSURE_LINES):
             self.sensor.exposure_ns = self.exposure_ns()

@@ -17,6 +17,9 @@ from tests.contract.stage import Stage
 BIT_DEPTHS = {"GREY": 8, "Y10 ": 10, "Y12 ": 12, "Y16 ": 16, "Y10P": 10, "YUYV": 8, "UYVY": 8, "MJPG": 8, "RG10": 10}
 GAIN_UNITS = 16
 """The device's number for gain 1."""
+BLUR_PX = 0.06
+"""Standard deviation of the blur by a lens that stands one unit of its focus away from where it makes sharp pictures.
+"""
 
 
 def encoded(image: Pixels, code: str, row_bytes: int) -> bytes:
@@ -53,17 +56,24 @@ def _packed(row: Pixels) -> list[int]:
 class Sensor:
     """What a fake camera sees: each question is one exposure, each answer the bytes of one frame.
 
-    bands : a rolling shutter is so many bands of rows, exposed one after another within the read-out.
+    rolling : its rows are exposed one after another, within the read-out. sharp_at : the place of its lens that makes a
+    sharp picture; others blur it by `BLUR_PX` for each unit of its focus.
     noise_when_corrupt : whether a corrupt frame holds random bytes; otherwise its second half is missing.
     asked : every question so far, the truth about the frames that came.
     """
 
     def __init__(
-        self, stage: Stage, *, readout_s: float = 0.0, bands: int = 1, noise_when_corrupt: bool = True
+        self,
+        stage: Stage,
+        *,
+        readout_s: float = 0.0,
+        rolling: bool = False,
+        sharp_at: int = 0,
+        noise_when_corrupt: bool = True,
     ) -> None:
         self.stage = stage
-        self.readout_ns = round(readout_s * 1e9)
-        self.bands = bands
+        self.readout_ns = round(readout_s * 1e9) if rolling else 0
+        self.sharp_at = sharp_at
         self.noise_when_corrupt = noise_when_corrupt
         self.rng = np.random.default_rng(1)
         self.asked: list[dict[str, Any]] = []
@@ -77,14 +87,13 @@ class Sensor:
 
     def image(self, asked: dict[str, Any]) -> Pixels:
         start_ns, exposure_ns = asked["start_ns"], asked["exposure_ns"]
-        gain = max(asked["gain"], GAIN_UNITS) / GAIN_UNITS
-        whole = np.zeros(self.stage.format.size.shape, np.uint16)
-        rows = np.array_split(np.arange(len(whole)), self.bands)
-        for band, part in enumerate(rows):
-            late_ns = self.readout_ns * band // max(self.bands - 1, 1)
-            seen = self.stage.exposed(start_ns + late_ns, start_ns + late_ns + exposure_ns, gain=gain)
-            whole[part] = seen[part]
-        return whole.astype(np.uint8) if self.stage.format.bit_depth <= 8 else whole
+        return self.stage.exposed(
+            start_ns,
+            start_ns + exposure_ns,
+            gain=max(asked["gain"], GAIN_UNITS) / GAIN_UNITS,
+            readout_ns=self.readout_ns,
+            defocus_px=BLUR_PX * abs(asked["focus"] - self.sharp_at),
+        )
 
 
 class SensorService(Sensor):

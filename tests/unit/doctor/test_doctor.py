@@ -20,7 +20,7 @@ from slrig.capture import measure_latency
 from slrig.devices import AppliedSettings, Camera, CameraSettings, Projector, Rig, Trigger
 from slrig.doctor import timing
 from slrig.doctor.doctor import Diagnosis, doctor_sequence, examine
-from slrig.doctor.image import check_calibrated, check_sharpening, measure_response
+from slrig.doctor.image import check_calibrated, check_exposures, check_sharpening, check_steady, measure_response
 from slrig.doctor.light import CameraSession, Finding, Severity, locate_picture, measure_light
 from slrig.doctor.measures import depth_mm_per_px
 from slrig.errors import FrameTimeoutError, ScanEvidenceError, UnsupportedByDeviceError
@@ -48,14 +48,15 @@ Process = Callable[[Pixels], Pixels]
 class OtherCamera:
     """A rendered camera that is another in what a test names. lose : the reads, counted from 1, that time out.
 
-    change : what it makes of its frames before it gives them. longest_s : the exposure that it really takes.
+    change : what it makes of its frames before it gives them. longest_s : an exposure that is longer cannot be armed.
+    takes : the exposure that it takes for one that it says to take.
     """
 
     def __init__(
         self, camera: Camera, *, lose: Container[int] = (), change: Callable[[Frame], Frame] = lambda each: each,
-        longest_s: float = math.inf, **info: Any,
+        longest_s: float = math.inf, takes: Callable[[float], float] = lambda each: each, **info: Any,
     ) -> None:  # fmt: skip
-        self._camera, self._lose, self._change, self._longest_s = camera, lose, change, longest_s
+        self._camera, self._lose, self._change, self._longest_s, self._takes = camera, lose, change, longest_s, takes
         self.info = replace(camera.info, **info)
         self._reads = 0
 
@@ -63,7 +64,8 @@ class OtherCamera:
         return getattr(self._camera, name)
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        self._applied = self._camera.configure(settings)
+        self._camera.configure(replace(settings, exposure_s=self._takes(settings.exposure_s)))
+        self._applied = AppliedSettings(settings.exposure_s, settings.gain)
         return self._applied
 
     def arm(self, count: int, trigger: Trigger) -> None:
@@ -363,13 +365,39 @@ def test_what_the_camera_makes_of_light_is_not_blamed_on_the_projector(
 ) -> None:
     with small_rig(tmp_path, eye=EYE | {"response": response}, lamp=LAMP | {"gamma": gamma}, ambient=0.1) as rig:
         session = CameraSession(processing(rig, limited) if is_limited else rig, "eye", wait_s=0.05)
-        light, _ = measure_light(session, doctor_sequence(rig.projector.info.size), displays="")
+        sequence = doctor_sequence(rig.projector.info.size)
+        light, _ = measure_light(session, sequence, displays="")
         assert light is not None
-        curve, findings = measure_response(session, light)
+        light, exponent, camera = check_exposures(session, sequence, light)
+        curve, findings = measure_response(session, light, exponent)
     assert curve is not None
-    assert {each.name for each in findings} == names
+    assert {each.name for each in (*findings, *camera)} == names
     assert curve.gamma == pytest.approx(gamma, abs=0.06)
     assert (curve.black_knee, curve.white_knee) == pytest.approx((16, 235) if is_limited else (0, 255), abs=3)
+
+
+@pytest.mark.parametrize("response", [1.0, 0.5])
+@pytest.mark.parametrize(
+    ("takes", "name", "taken_s"),
+    [
+        (lambda asked_s: asked_s, "response.camera", math.inf),
+        (lambda asked_s: min(asked_s, 0.009), "exposure.clamped", 0.009),
+        (lambda asked_s: min(asked_s, 0.004), "exposure.clamped", 0.004),
+        (lambda _: 0.01, "exposure.ignored", math.inf),
+    ],
+)
+def test_exposures_that_a_camera_never_took_show_in_its_pictures(
+    tmp_path: Path, takes: Callable[[float], float], name: str, taken_s: float, response: float
+) -> None:
+    with small_rig(tmp_path, eye=EYE | {"response": response}, ambient=0.1) as opened:
+        rig = with_camera(opened, takes=takes)
+        session, sequence = CameraSession(rig, "eye", wait_s=0.05), doctor_sequence(rig.projector.info.size)
+        light, _ = measure_light(session, sequence, displays="")
+        assert light is not None
+        light, _, [found] = check_exposures(session, sequence, light)
+    assert found.name == name
+    assert light.taken_s == pytest.approx(taken_s, rel=0.06)
+    assert light.exposure_s <= 1.06 * taken_s
 
 
 def grey(values: FloatArray) -> Pixels:
@@ -411,6 +439,19 @@ def after(*steps: Process) -> Process:
         return image
 
     return process
+
+
+@pytest.mark.parametrize(("process", "severity"), [(lambda image: image, Severity.OK), (blur, Severity.FAULT)])
+def test_a_lens_that_moves_after_its_focus_was_measured_is_named(
+    rig: Rig, process: Process, severity: Severity
+) -> None:
+    session, sequence = CameraSession(rig, "eye", wait_s=0.05), doctor_sequence(rig.projector.info.size)
+    light, _ = measure_light(session, sequence, displays="")
+    assert light is not None
+    picture, _ = locate_picture(session, sequence, light, None)
+    moved = with_camera(rig, change=lambda frame: replace(frame, image=process(frame.image)))
+    [found] = check_steady(CameraSession(moved, "eye", wait_s=0.05), sequence, light, picture)
+    assert (found.name, found.severity) == ("picture.steady", severity)
 
 
 @pytest.fixture(scope="module")

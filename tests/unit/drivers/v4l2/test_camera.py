@@ -200,7 +200,7 @@ def test_of_exposures_that_the_camera_takes_the_nearest_is_used(plugged: Plug, w
 
 
 def test_settings_that_a_camera_forgets_at_its_start_are_sent_again(plugged: Plug) -> None:
-    device = plugged(Faked(forgets_at_start=True))
+    device = plugged(Faked(controls=changed("Exposure Time, Absolute", forgets_at_start=True)))
     for exposure_s in (0.002, 0.004):
         camera = armed(device, CameraSettings(exposure_s))
         camera.read(0, 2)
