@@ -551,7 +551,7 @@ def _choose_trigger(name: str, camera: Camera, requested: Trigger | None) -> Tri
     raise UnsupportedByDeviceError(
         f"camera '{name}' can be triggered by: {', '.join(sorted(offered)) or 'none'}; latency is measured with "
         + ("a free-running or software-triggered camera" if requested is None else f"{requested} trigger as requested")
-        + ", and a projector that triggers its cameras by wire needs no latency"
+        + "; scans by wire need no latency, and how often pulses may come, trigger_period_s, slrig doctor measures"
     )
 
 

@@ -241,6 +241,8 @@ def _rig_table(synchronisation: Synchronisation) -> str:
     ]
     if synchronisation.earliest_s is not None:
         lines.append(f"earliest_s = {_number(synchronisation.earliest_s)}")
+    if synchronisation.trigger_period_s is not None:
+        lines.append(f"trigger_period_s = {_number(synchronisation.trigger_period_s)}")
     if synchronisation.line_time_s:
         lines += ["", "[synchronisation.line_time_s]"]
         lines += [f"{name} = {_number(line_s, digits=9)}" for name, line_s in synchronisation.line_time_s.items()]

@@ -125,10 +125,13 @@ class Diagnosis:
         )
 
 
-def latency_document(measured: LatencyMeasurement) -> dict[str, Any]:
-    """Synchronisation and latencies of the cameras as JSON can hold them."""
+def latency_document(measured: LatencyMeasurement, known: Synchronisation | None) -> dict[str, Any]:
+    """Synchronisation and latencies of the cameras as JSON can hold them. known : what the rig file says: it keeps the
+    period of its trigger pulses, which flashes do not measure.
+    """
     cameras = {name: asdict(each) for name, each in measured.cameras.items()}
-    document: dict[str, Any] = _to_json({"synchronisation": asdict(measured.synchronisation), "cameras": cameras})
+    found = replace(measured.synchronisation, trigger_period_s=None if known is None else known.trigger_period_s)
+    document: dict[str, Any] = _to_json({"synchronisation": asdict(found), "cameras": cameras})
     return document
 
 

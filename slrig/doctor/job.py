@@ -90,11 +90,12 @@ class LatencyJob(Job):
 
     def capture(self, rig: RigSession, run: JobRun) -> Outcome:
         """Flash the projector, and fit latency and line time of each camera. Raises DeviceError, ScanEvidenceError."""
+        opened = rig.open()
         measured = measure_latency(
-            rig.open(), trials=self.trials, search_s=self.search_s, exposure_s=self.exposure_s, trigger=self.trigger,
+            opened, trials=self.trials, search_s=self.search_s, exposure_s=self.exposure_s, trigger=self.trigger,
             on_progress=run.step,
         )  # fmt: skip
-        return Outcome({"rig": rig.name, **latency_document(measured)})
+        return Outcome({"rig": rig.name, **latency_document(measured, opened.synchronisation)})
 
 
 EXAMINATIONS = (JobKind.DOCTOR, JobKind.LATENCY, JobKind.CONFORMANCE)

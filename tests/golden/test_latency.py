@@ -107,19 +107,23 @@ def test_latency_and_shutter_are_those_of_the_rig_file(
 
 def test_the_command_prints_a_table_that_the_rig_file_takes(tmp_path: Path) -> None:
     path = written(tmp_path / "rig", latency_s=0.031, exposure_s=0.01, line_s=3e-5, twin=True)
+    bare = path.read_text()
+    path.write_text(f"{bare}\n[synchronisation]\ntrigger_period_s = 0.02\n")
     done = CliRunner().invoke(app, ["latency", str(path), "--flashes", "20"])
     assert done.exit_code == 0, done.output
     assert "camera camera0" in done.stdout
     assert "rolling shutter: 30." in done.stdout or "rolling shutter: 29.9" in done.stdout
     assert "global shutter" in done.stdout.partition("camera camera1")[2]
     table = done.stdout[done.stdout.index("[synchronisation]") :]
-    path.write_text(path.read_text() + table)
+    path.write_text(bare + table)
     with open_rig(read_rig(path)) as rig:
         kept = rig.synchronisation
         assert kept is not None
         assert kept.latency_s == pytest.approx(0.031, abs=0.5e-3)
         assert 0 < kept.latency_error_s < 0.5e-3
         assert kept.line_time_s == {"camera0": pytest.approx(3e-5, rel=0.02)}
+        # What flashes do not measure stays.
+        assert kept.trigger_period_s == 0.02
 
 
 def images(path: Path, synchronisation: Synchronisation | None) -> dict[tuple[int, str], FloatArray]:
