@@ -339,6 +339,30 @@ def test_a_wire_trigger_is_set_while_it_is_off_and_overlaps_the_readout(
         assert held(memory, "TriggerOverlap") == [overlap]
 
 
+@pytest.mark.parametrize(("features", "taken"), [({}, 2), ({"TriggerOverlap": "Off"}, 1)])
+def test_pulses_during_the_readout_are_taken_though_the_camera_takes_none_by_default(
+    features: dict[str, object], taken: int
+) -> None:
+    class Pulsing(Stage):
+        """Sends the next pulse while the sensor is read out."""
+
+        def exposed(self, t_start_ns: int, t_end_ns: int, *, gain: float = 1.0) -> Pixels:
+            if len(memory.exposures) == 1:
+                memory.pulse()
+            return super().exposed(t_start_ns, t_end_ns, gain=gain)
+
+    memory = MemoryCamera(Pulsing(scene()))
+    with gentl_bench.serving(memory) as producer:
+        camera = gentl_bench.opened(producer, features=features)
+        camera.arm(2, Trigger.HARDWARE)
+        memory.pulse()
+        for _ in range(taken):
+            camera.read(0, LONG_S)
+        with pytest.raises(FrameTimeoutError):
+            camera.read(0, SHORT_S)
+        camera.close()
+
+
 @pytest.mark.parametrize(
     ("device", "options"),
     [
