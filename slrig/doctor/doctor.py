@@ -415,7 +415,11 @@ def _describe_devices(rig: Rig, displays: Sequence[FoundDevice]) -> list[Finding
         listed = "; ".join(f"{each.device} ({each.driver}): {each.label}" for each in displays)
         findings.append(ok("device.displays", "projector", f"projectors and outputs that were found: {listed}"))
     if rig.calibration is None:
-        remedy = "calibrate it after the other findings are corrected; without calibration, scans have no millimetres"
+        # Lenses that nobody knows explain a picture that is zoomed or warped from four corners as well as a true one.
+        remedy = (
+            "switch keystone correction, digital zoom and overscan off, which cannot be seen before, and calibrate it "
+            "after the other findings are corrected; without calibration, scans have no millimetres"
+        )
         findings.append(note("device.uncalibrated", "rig", "it has no calibration", remedy))
     return findings
 
