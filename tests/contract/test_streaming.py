@@ -111,7 +111,6 @@ def pace_s(rig: Rig) -> tuple[float, int]:
         pytest.param([Webcam()], 1 / 30, 1.1, id="whole frames"),
         # A tenth of the patterns is shown again, for as long as the others.
         pytest.param([Webcam(lost=0.1)], 0.01, 1.3, id="frames get lost"),
-        pytest.param([Webcam(jitter_s=0.004)], 0.01, 1.3, id="uneven stamps"),
         # Those that start alike run in phase, though starting takes a time that is no whole number of frames.
         pytest.param([Webcam(start_s=0.215)] * 2, 0.01, 1.1, id="two cameras"),
     ],
