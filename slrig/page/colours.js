@@ -80,7 +80,7 @@ async function deviation(worker, mesh, other) {
   if (sizes.length === 0) return {values, words: `Nothing of the other scan is within ${length(reachMm)}.`};
   const [half, most] = [0.5, 0.95].map((share) => sizes[Math.floor(share * (sizes.length - 1))]);
   const sigmaMm = Math.hypot(typicalSigma(mesh), typicalSigma(other));
-  const words = `Half lie within ${length(half)}, 95 % within ${length(most)}; ${percent(Number((sizes.length / values.length).toPrecision(3)))} could be compared. σ of the difference: ${length(sigmaMm)}; less than twice that says nothing.`;
+  const words = `Half lie within ${length(half)}, 95 % within ${length(most)}; ${percent(sizes.length / values.length)} could be compared. σ of the difference: ${length(sigmaMm)}; less than twice that says nothing.`;
   return {values, range: [-most, most], words};
 }
 

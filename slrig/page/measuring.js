@@ -1,7 +1,7 @@
 // Measuring in the view: what is chosen, what is clicked, and the figures at the line and in a table.
 import {html, useState} from "./vendor/preact-htm.js";
 import {distance, fit, patch, pointToPlane, radius, section} from "./measure.js";
-import {Action, Choice, Field, length} from "./ui.js";
+import {Action, Choice, Field, count, length, number} from "./ui.js";
 
 const KINDS = [["distance", "Distance"], ["plane", "Point to plane"], ["sphere", "Sphere"], ["cylinder", "Cylinder"], ["section", "Section"]];
 const TOLD = Object.fromEntries(KINDS);
@@ -15,7 +15,7 @@ const FITTED = ["plane", "sphere", "cylinder"];
 const USUAL_PATCH = 0.06;
 
 /** As many digits as its standard deviation lets one read. */
-const millimetres = (mm, sigmaMm) => `${mm.toFixed(sigmaMm > 0 ? Math.min(Math.max(-Math.floor(Math.log10(sigmaMm / 3)), 1), 4) : 3)} mm`;
+const millimetres = (mm, sigmaMm) => `${number(mm, {decimals: sigmaMm > 0 ? Math.min(Math.max(-Math.floor(Math.log10(sigmaMm / 3)), 1), 4) : 3})}\u00a0mm`;
 const figure = ({kind, valueMm, sigmaMm}) => `${["sphere", "cylinder"].includes(kind) ? "radius " : ""}${millimetres(valueMm, sigmaMm)}, σ ${length(sigmaMm)}`;
 
 /** All that measuring needs to know, and what changes it. */
@@ -122,10 +122,10 @@ function anchorOf(kind, picks, found) {
 }
 
 export function Measured({done, clear}) {
-  const at = ({pointMm}) => `(${pointMm.map((mm) => mm.toFixed(3).replace("-", "−")).join(", ")})`;
+  const at = ({pointMm}) => `(${pointMm.map((mm) => number(mm, {decimals: 3})).join(", ")})`;
   return html`<table class="measured"><thead><tr><th>What</th><th>Value</th><th>σ</th></tr></thead>
       <tbody>${done.map(({kind, picks, valueMm, sigmaMm}) => html`<tr><td>${TOLD[kind]}</td><td>${millimetres(valueMm, sigmaMm)}</td><td>${length(sigmaMm)}</td></tr>
-        <tr class="quiet"><td colspan="3">${picks.map(at).join(" to ")} mm${picks[0].form && `; fit of ${picks[0].form.points} points, rms ${length(picks[0].form.rmsMm)}`}</td></tr>`)}</tbody></table>
+        <tr class="quiet"><td colspan="3">${picks.map(at).join(" to ")} mm${picks[0].form && `; fit of ${count(picks[0].form.points)} points, rms ${length(picks[0].form.rmsMm)}`}</td></tr>`)}</tbody></table>
     <p class="quiet">σ comes from that of the mesh: noise, and the calibration's error where that is stated. A fitted patch counts as 16 independent points, because neighbours err alike.
       Not in it: where you clicked, and what all points share, such as a wrong scale.</p>
     <${Action} onClick=${clear}>Clear<//>`;

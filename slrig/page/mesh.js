@@ -3,7 +3,7 @@ import {html, useEffect, useRef, useState} from "./vendor/preact-htm.js";
 import {useTold} from "./colours.js";
 import {fetchMesh} from "./glb.js";
 import {MeasureBar, Marks, Measured, useMeasuring} from "./measuring.js";
-import {Action, Choice, Refusal, count, percent} from "./ui.js";
+import {Action, Choice, Refusal, count, number, percent} from "./ui.js";
 import {Panel, Workspace} from "./workspace.js";
 
 const COLOURS = [
@@ -174,10 +174,10 @@ function useRange(mode, scan, report, coarse, told) {
   return most > least ? [least, most] : [least, least + 1];
 }
 
-const inMm = (mm) => `${Number(mm.toPrecision(3)).toString().replace("-", "−")} mm`;
+const inMm = (mm) => `${number(mm)}\u00a0mm`;
 const SCALES = {
   sigma: ["Standard deviation along the normal; the ends are the 5 % and 95 % of this scan.", (value) => inMm(value * SIGMA_STEP_MM)],
-  stripe: ["Projector line.", (value) => `${Math.round(value)} px`],
+  stripe: ["Projector line.", (value) => `${count(value)}\u00a0px`],
   depth: ["Depth, z of the scan's axes; nearer is less.", inMm],
   deviation: ["Distance to the other scan; orange lies before it, blue behind.", inMm],
 };
@@ -189,7 +189,7 @@ function Legend({mode, range: [least, most], axis, styles, told, other, back}) {
       <div style=${{background: mode === "deviation" ? styles.signed : styles.scale}}></div>
       <div class="between">${[least, (least + most) / 2, most].map((value) => html`<span>${written(value)}</span>`)}</div>${told.words && html`<p>${told.words}</p>`}</div>`;
   }
-  const entries = mode === "cause" || mode === "views" ? told.kinds.filter(({share}) => share > LEAST_SHARE).sort((a, b) => b.share - a.share).map(({colour, words, share}) => [colour, `${words}, ${percent(Number(share.toPrecision(2)))}`])
+  const entries = mode === "cause" || mode === "views" ? told.kinds.filter(({share}) => share > LEAST_SHARE).sort((a, b) => b.share - a.share).map(({colour, words, share}) => [colour, `${words}, ${percent(share)}`])
     : mode === "shaded" ? [...other ? [[PLAIN[0], "this scan"], [PLAIN[1], "the other"]] : [], ...back ? [[styles.back, "back side"]] : []] : [];
   return html`<div class="scale">${told.chooser}${entries.map(([colour, words]) => html`<div class="legend"><span class="swatch" style=${{background: colour}}></span>${words}</div>`)}</div>`;
 }
