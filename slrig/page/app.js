@@ -7,6 +7,7 @@ import {HealthScreen} from "./health.js";
 import {ModelsScreen} from "./models.js";
 import {ResultScreen} from "./result.js";
 import {ScanScreen} from "./scan.js";
+import {ScansScreen} from "./scans.js";
 import {ask, entered, useAction, useValue, watchProblems} from "./service.js";
 import {Action, Badge, Refusal, usePlace} from "./ui.js";
 
@@ -79,7 +80,7 @@ function Rooms({session, left}) {
   const may = (scope) => session.scopes.includes(scope);
   const given = {rig, again, may, place: rest};
   const screens = {
-    scan: rest.length ? html`<${ResultScreen} key=${rest[0]} id=${rest[0]} ...${given} />` : html`<${ScanScreen} ...${given} />`,
+    scan: rest[0] === "all" ? html`<${ScansScreen} ...${given} />` : rest.length ? html`<${ResultScreen} key=${rest[0]} id=${rest[0]} ...${given} />` : html`<${ScanScreen} ...${given} />`,
     models: html`<${ModelsScreen} ...${given} />`,
     calibrate: html`<${CalibrateScreen} ...${given} />`,
     health: html`<${HealthScreen} ...${given} />`,

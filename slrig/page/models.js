@@ -1,5 +1,7 @@
 // Models: scans of one object from several sides, shot on a turntable or by hand, or chosen, and the one mesh that is made of them.
+import {Downloads} from "./downloads.js";
 import {Mesh, loadDrawing} from "./mesh.js";
+import {NameHeading} from "./names.js";
 import {ask, follow, once, useAction, useValue} from "./service.js";
 import {Action, Confirm, Facts, Field, JobBadge, Progress, Refusal, count, length, moment, percent} from "./ui.js";
 import {html, useEffect, useState} from "./vendor/preact-htm.js";
@@ -7,11 +9,6 @@ import {html, useEffect, useState} from "./vendor/preact-htm.js";
 const MODEL = "model.ply";
 const USUAL_VIEWS = 8;
 const over = (model) => ["succeeded", "failed", "cancelled", "interrupted"].includes(model.state);
-const PURPOSES = {
-  [MODEL]: "the model in mm, with σ for each vertex", "model.glb": "for viewers and web pages, in metres", "placed.ply": "all views in one frame, not merged",
-  "poses.json": "where each view belongs, and the turntable's axis", "report.json": "all figures of this model", "sides.png": "a picture from six sides",
-  "view.glb": "what this page shows", "coarse.glb": "what this page shows first",
-};
 
 export function ModelsScreen({rig, may, place}) {
   return place.length ? html`<${Back} /><${One} key=${place[0]} id=${place[0]} may=${may} />` : html`<${All} rig=${rig} may=${may} />`;
@@ -96,8 +93,8 @@ function Whole({model, again, may}) {
   }, again), [done]);
   const drawn = {id: model.id, links: model.links, merged: true, plan: {}, summary: {mesh: {sigma_mm: report?.model.sigma_ends_mm}}};
   return html`
-    <div class="between"><h2>${model.label ?? `Model of ${moment(model.created_at)}`} <${JobBadge} state=${model.state} /></h2>
-      ${files[MODEL] && html`<a class="action primary" href=${files[MODEL]} download=${MODEL}>Download the model</a>`}</div>
+    <div class="between"><${NameHeading} job=${model} kind="Model" may=${may("scan")} again=${again}><${JobBadge} state=${model.state} /><//>
+      ${Object.keys(files).length > 0 && html`<${Downloads} files=${files} />`}</div>
     <div class="two">
       <section aria-label="Mesh">
         ${!done && html`<div class="box"><${Progress} label=${told.stage} fraction=${told.fraction} detail=${told.detail} />
@@ -108,8 +105,6 @@ function Whole({model, again, may}) {
       <section aria-label="Figures">
         <${Refusal} problem=${refused} />
         ${report && html`<${Figures} report=${report} path=${files["report.json"]} />`}
-        ${Object.keys(files).length > 0 && html`<h3>Files</h3><div class="wide"><table><thead><tr><th>File</th><th>For</th></tr></thead>
-          <tbody>${Object.entries(files).map(([name, path]) => html`<tr><td><a href=${path} download=${name}>${name}</a></td><td>${PURPOSES[name] ?? ""}</td></tr>`)}</tbody></table></div>`}
         ${may("scan") && html`<${Keeping} model=${model} done=${done} again=${again} />`}
       </section>
     </div>

@@ -1,7 +1,9 @@
 // A scan's result: its mesh, its figures, why pixels are missing, its files, and another scan beside it.
 import {Causes} from "./causes.js";
+import {Downloads} from "./downloads.js";
 import {limitToBox, limits} from "./limits.js";
 import {Mesh, loadDrawing} from "./mesh.js";
+import {NameHeading} from "./names.js";
 import {ask, follow, once, useAction, useValue} from "./service.js";
 import {Action, Confirm, Facts, JobBadge, Progress, Refusal, count, length, moment, percent} from "./ui.js";
 import {Panel, Workspace} from "./workspace.js";
@@ -10,23 +12,6 @@ import {html, useEffect, useState} from "./vendor/preact-htm.js";
 const OVER = ["succeeded", "failed", "cancelled", "interrupted"];
 const MESH = "mesh.ply";
 const LOOK_AGAIN_S = 10;
-
-const PURPOSES = {
-  "mesh.ply": "the mesh in mm, with σ for each vertex", "mesh.glb": "for viewers and web pages, in metres", "mesh.stl": "for CAD and printing, in mm",
-  "mesh.obj": "for modelling programs, in mm", "mesh.3mf": "for CAD and printing, in mm, with colours", "points.ply": "the points before meshing", "report.json": "all figures of this scan",
-  "preview.png": "a picture to send", "bundle.zip": "the frames and the calibration, to compute it all again", "view.glb": "what this page shows",
-  "coarse.glb": "what this page shows first", "scan.mcap": "a bag for ROS 2 and Foxglove, in metres", "calibration.json": "lenses and poses of this scan's devices",
-};
-/** Made when they are asked for: to ask for their size would make them. */
-const MADE_LATER = ["mesh.stl", "mesh.obj", "mesh.3mf", "view.glb", "coarse.glb", "scan.mcap", "bundle.zip"];
-const OF_CAMERAS = [
-  [/^causes-/, "causes as numbers, for programs"], [/^rejected-/, "why pixels gave no point, as a picture"],
-  [/^agreement-/, "how far columns and rows disagree at each pixel"],
-  [/^points-.*npz$/, "a point for each pixel of the camera, for numpy"], [/^points-/, "the same for point-cloud programs"],
-  [/^depth-/, "depth at each pixel of the camera, as a picture of 16 bits"],
-];
-const isMadeLater = (name) => MADE_LATER.includes(name) || /^(points|depth)-/.test(name);
-const purpose = (name) => PURPOSES[name] ?? OF_CAMERAS.find(([form]) => form.test(name))?.[1] ?? "";
 
 export function ResultScreen({id, may}) {
   const [scan, problem, again] = useValue(`/scan/${encodeURIComponent(id)}`, LOOK_AGAIN_S);
@@ -39,7 +24,7 @@ export function ResultScreen({id, may}) {
   return html`<${Result} scan=${scan} again=${again} may=${may} />`;
 }
 
-const Back = () => html`<p><a href="#/scan">All scans</a></p>`;
+const Back = () => html`<p><a href="#/scan/all">All scans</a></p>`;
 
 function Result({scan, again, may}) {
   const {files} = scan.links;
@@ -58,13 +43,12 @@ function Result({scan, again, may}) {
     ${hasMesh && html`<p role="status">The mesh is ready. The other files are being computed.</p>`}
     <${Progress} label=${told.stage} fraction=${told.fraction} detail=${told.detail} /></div>`;
   const head = html`<div class="head"><${Back} />
-      <h2>${scan.label ?? `Scan of ${moment(scan.created_at)}`} <${JobBadge} state=${scan.state} /></h2>
-      ${hasMesh && html`<a class="action primary" href=${files[MESH]} download="mesh.ply">Download the mesh</a>`}</div><${Refusal} problem=${refused} />`;
+      <${NameHeading} job=${scan} kind="Scan" may=${may("scan")} again=${again}><${JobBadge} state=${scan.state} /><//>
+      ${Object.keys(files).length > 0 && html`<${Downloads} files=${files} />`}</div><${Refusal} problem=${refused} />`;
   const panels = html`${hasMesh && html`<${Panel} name="Figures"><${Figures} scan=${scan} report=${report} /><//>`}
     ${report && Object.entries(report.cameras).map(([name, camera]) => html`<${Panel} key=${name} name=${`Camera ${name}`}>
       <${Causes} camera=${name} told=${camera} causes=${report.causes} files=${files} device=${calibration?.cameras[name] ?? null} pointed=${pointed} point=${point} /><//>`)}
     ${over && hasMesh && html`<${Panel} name="Compare"><${Compare} scan=${scan} chosen=${setOther} /><//>`}
-    ${Object.keys(files).length > 0 && html`<${Panel} name="Files" open=${false}><${Downloads} key=${over} files=${files} /><//>`}
     <${Panel} name="Keep or delete"><${Keeping} scan=${scan} over=${over} again=${again} may=${may} /><//>`;
   if (hasMesh)
     return html`<${Mesh} key=${scan.id} scan=${scan} other=${other} report=${report} calibration=${calibration} again=${may("scan") ? limitToBox : null} over=${progress}
@@ -139,20 +123,6 @@ function Compare({scan, chosen}) {
       <tbody>${rows.map(([name, mine, written, theirs]) => html`<tr><th scope="row">${name}</th><td>${mine === undefined ? "–" : written(mine)}</td>
         <td>${theirs === undefined ? "–" : written(theirs)}</td><td>${mine === undefined || theirs === undefined ? "–" : `${theirs < mine ? "−" : "+"}${written(Math.abs(theirs - mine))}`}</td></tr>`)}</tbody></table></div>
       <p class="quiet">Each is shown where its own calibration puts it. The colours "Deviation" show how far this mesh is from the other one.</p>`}`;
-}
-
-function Downloads({files}) {
-  const [sizes, setSizes] = useState({});
-  useEffect(() => {
-    for (const name of Object.keys(files).filter((each) => !isMadeLater(each)))
-      fetch(files[name], {method: "HEAD"}).then((answer) => {
-        const bytes = Number(answer.headers.get("Content-Length"));
-        if (answer.ok && bytes) setSizes((before) => ({...before, [name]: bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`}));
-      }, () => {});
-  }, []);
-  return html`<div class="wide"><table><thead><tr><th>File</th><th>Size</th><th>For</th></tr></thead>
-    <tbody>${Object.entries(files).map(([name, path]) => html`<tr><td><a href=${path} download=${name}>${name}</a></td>
-      <td>${sizes[name] ?? (isMadeLater(name) ? "made when asked for" : "–")}</td><td>${purpose(name)}</td></tr>`)}</tbody></table></div>`;
 }
 
 function Keeping({scan, over, again, may}) {

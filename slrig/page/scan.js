@@ -2,8 +2,9 @@
 import {html, useEffect, useState} from "./vendor/preact-htm.js";
 import {Limits, useLimits} from "./limits.js";
 import {Live} from "./live.js";
+import {NameField, called, useName} from "./names.js";
 import {ask, follow, once, useAction, useValue} from "./service.js";
-import {Action, JobBadge, Progress, Refusal, count, length, moment} from "./ui.js";
+import {Action, JobBadge, Progress, Refusal, count, length} from "./ui.js";
 
 const SHOWN = 12;
 const SEQUENCES = {fast: "fast: fewest frames", standard: "standard", robust: "robust: for what reflects or is hollow", phase: "phase: few frames, in shades of grey"};
@@ -16,13 +17,15 @@ export function ScanScreen({rig, may}) {
   const [preset, setPreset] = useState("");
   const [sequence, setSequence] = useState("");
   const [typed, region, change] = useLimits();
+  const [name, setName, used] = useName();
   const scans = list?.scans ?? [];
   // The oldest that is not over holds the rig, whoever asked for it, and also after this page was loaded anew.
   const active = scans.filter((scan) => !over(scan)).at(-1);
   const [start, busy, refused] = useAction(async () => {
-    const body = {if_busy: "queue", ...(preset ? {preset} : {}), ...(sequence ? {patterns: {sequence}} : {}), ...(bracket ? {exposures_s: bracket} : {}), ...(region ? {reconstruction: {region}} : {})};
+    const body = {if_busy: "queue", ...(preset ? {preset} : {}), ...(sequence ? {patterns: {sequence}} : {}), ...(bracket ? {exposures_s: bracket} : {}), ...(region ? {reconstruction: {region}} : {}), label: name.trim() || null};
     const scan = await ask("POST", "/scan", {body, headers: once()});
     sessionStorage.setItem("asked", scan.id);
+    used();
     await again();
   });
   const blocked = !rig ? "The service has not told of the rig yet." : rig.error ?? (rig.calibrated === false ? "The rig has no calibration: a scan would have no millimetres." : null);
@@ -31,6 +34,7 @@ export function ScanScreen({rig, may}) {
       <${Live} rig=${rig} may=${may} bracket=${bracket} setBracket=${setBracket} />
     </section>
     <section aria-label="Scan">
+      ${may("scan") && html`<${NameField} name=${name} change=${setName} entered=${start} />`}
       <${Action} kind="primary large" busy=${busy} disabled=${!may("scan")} onClick=${start}>Scan<//>
       ${may("scan") && known && html`<label>For an object that is <select value=${preset} onChange=${(event) => setPreset(event.target.value)}>
         <option value="">as the rig is set</option>${known.presets.filter(({fault}) => !fault).map(({name}) => html`<option value=${name}>${name}</option>`)}</select></label>`}
@@ -45,9 +49,9 @@ export function ScanScreen({rig, may}) {
     </section>
   </div>
   <section aria-label="Recent scans">
-    <h2>Recent scans</h2>
+    <div class="between"><h2>Recent scans</h2><a href="#/scan/all">All scans</a></div>
     <${Refusal} problem=${problem?.status ? problem : null} />
-    ${list && scans.length === 0 && html`<p class="quiet">None yet. The button above makes the first.</p>`}
+    ${list && scans.length === 0 && html`<p class="quiet">No scans yet. Name the part, then press Scan.</p>`}
     <ul class="cards">${scans.filter(over).map((scan) => html`<${Card} key=${scan.id} scan=${scan} />`)}</ul>
   </section>`;
 }
@@ -67,7 +71,7 @@ function UnderWay({scan, changed, may}) {
   }, changed), [scan.id]);
   const [cancel, busy, problem] = useAction(() => ask("POST", scan.links.cancel));
   return html`<div class="box">
-    <div class="between"><strong>${scan.label ?? "Scan"}</strong><${JobBadge} state=${state} /></div>
+    <div class="between"><strong>${called(scan)}</strong><${JobBadge} state=${state} /></div>
     <${Progress} label=${told.stage} fraction=${told.fraction} detail=${told.detail} />
     ${may("scan") && html`<${Action} busy=${busy} onClick=${cancel}>Stop it<//>`}
     <${Refusal} problem=${problem} />
@@ -77,8 +81,8 @@ function UnderWay({scan, changed, may}) {
 function Card({scan}) {
   const {picture} = scan.links;
   return html`<li><a class="card" href=${`#/scan/${scan.id}`}>
-    ${picture ? html`<img src=${picture} alt="" loading="lazy" />` : html`<span class="none" aria-hidden="true">no picture</span>`}
-    <span class="between"><span>${scan.label ?? moment(scan.created_at)}</span><${JobBadge} state=${scan.state} /></span>
+    ${picture ? html`<img class="alone" src=${picture} alt="" loading="lazy" width="320" height="240" />` : html`<span class="none" aria-hidden="true">No picture</span>`}
+    <span class="between"><span class="name">${called(scan)}</span><${JobBadge} state=${scan.state} /></span>
     ${scan.triangles !== null && html`<span class="quiet">${count(scan.triangles)} triangles, σ ${length(scan.sigma_mm)}</span>`}
     ${scan.error && html`<span class="quiet clip">${scan.error.detail}</span>`}
   </a></li>`;

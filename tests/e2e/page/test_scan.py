@@ -23,7 +23,7 @@ def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit:
     assert violations(page) == []
     page.get_by_label("Key").fill(KEY)
     page.keyboard.press("Enter")
-    page.get_by_text("None yet.").wait_for()
+    page.get_by_text("No scans yet.").wait_for()
     page.get_by_text("ready").wait_for()
     # A rig alone has no fleet.
     count(page.get_by_role("link", name="Fleet"), 0)
@@ -36,6 +36,7 @@ def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit:
     looks_as_kept(page, "scan")
     page.get_by_role("button", name="Off").click()
 
+    page.get_by_label("Name").fill("plate-007")
     page.get_by_role("button", name="Scan", exact=True).click()
     progress = page.get_by_role("progressbar")
     progress.wait_for()
@@ -44,12 +45,51 @@ def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit:
     page.reload()
     progress.wait_for()
     page.wait_for_url("**/#/scan/*-*")
+    # Saved by its name, which can be changed.
+    page.get_by_role("button", name="Download").click()
+    assert violations(page) == []
+    with page.expect_download() as download:
+        page.get_by_role("link", name="mesh.stl").click()
+    assert download.value.suggested_filename == "small-plate-007-mesh.stl"
+    page.keyboard.press("Escape")
+    page.get_by_role("button", name="Rename").click()
+    page.get_by_label("New name").fill("plate-007, turned")
+    page.keyboard.press("Enter")
+    page.get_by_role("heading", name="plate-007, turned").wait_for()
     page.goto(f"{service.url}/#/scan")
     page.reload()
     page.get_by_text("succeeded").wait_for()
     page.get_by_text("triangles, σ").wait_for()
     count(page.get_by_role("list").get_by_role("link"), 1)
+    assert page.get_by_label("Name").input_value() == "plate-008"
     assert violations(page) == []
+
+    # All scans: found, chosen by keyboard, fetched together, deleted.
+    with service.client() as client:
+        client.scans.cancel(client.scans.start(label="gone")["id"])
+    page.get_by_role("link", name="All scans").click()
+    cards = page.get_by_role("region", name="Today").get_by_role("link")
+    count(cards, 2)
+    page.get_by_role("link", name="gone").get_by_text("Cancelled", exact=True).wait_for()
+    page.locator("img").evaluate_all("(all) => Promise.all(all.map((each) => each.decode()))")
+    looks_as_kept(page, "scans")
+    cards.first.focus()
+    for key in ("Space", "ArrowRight", "Space"):
+        page.keyboard.press(key)
+    chosen = page.get_by_role("region", name="Selected scans")
+    chosen.get_by_text("1 without a mesh").wait_for()
+    assert violations(page) == []
+    with page.expect_download() as download:
+        chosen.get_by_role("button", name="Download 1 as zip").click()
+    assert download.value.suggested_filename == "small-1-scans-mesh.stl.zip"
+    page.get_by_role("searchbox").fill("GONE")
+    count(cards, 1)
+    chosen.get_by_role("button", name="Delete …").click()
+    chosen.get_by_role("alertdialog").get_by_role("button", name="Delete it").click()
+    page.get_by_text("No scan matches.").wait_for()
+    page.get_by_role("combobox", name="Day").select_option("last")
+    page.get_by_role("button", name="Show all").click()
+    count(cards, 1)
 
     # A phone, a dark room, and a key for looking.
     secret = looking(service)

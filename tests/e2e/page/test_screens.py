@@ -222,7 +222,9 @@ def test_scans_are_joined_and_an_object_is_turned_by_hand(start: Start, tmp_path
     page.get_by_text("succeeded").wait_for()
     page.get_by_role("img", name="The model from six sides").wait_for()
     page.locator("canvas[data-level=full]").wait_for()
-    count(page.get_by_role("region", name="Figures").get_by_text("model.ply"), 1)
+    page.get_by_role("button", name="Download").click()
+    page.get_by_role("link", name="model.ply").wait_for()
+    page.keyboard.press("Escape")
     page.get_by_role("columnheader", name="Over σ").wait_for()
     page.get_by_role("button", name="σ", exact=True).click()
     assert page.get_by_role("button", name="Stripe").count() == 0
@@ -303,7 +305,7 @@ COMPLAINT = "Failed to load resource"
 def test_a_camera_is_unplugged_and_a_key_expires(start: Start, tmp_path: Path, visit: Visit) -> None:
     service = start(write_rig(tmp_path / "rig", faults="[head.faults]\nunplug_camera_at_frame = 5"))
     page = visit(service, "scan")
-    page.get_by_text("None yet.").wait_for()
+    page.get_by_text("No scans yet.").wait_for()
     page.get_by_role("button", name="Scan", exact=True).click()
     failed = page.get_by_role("alert").filter(has_text="The last scan failed")
     failed.get_by_text("camera 'left' is gone (unplugged or powered off); plug it in").wait_for()
