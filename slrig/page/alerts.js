@@ -35,7 +35,7 @@ function Receiver({of, able, test, trial, changed}) {
   const name = NAMES[of.name] ?? of.name;
   return html`<section class="box" aria-label=${name}>
     <p><strong>${name}</strong> at ${of.host}${of.fixed && html` <span class="quiet">(in the service's settings)</span>`}
-      ${of.waiting > 0 && html` <${Badge} kind="warn">${of.waiting} not delivered, oldest ${duration(of.oldest_s)}<//>`}</p>
+      ${of.waiting > 0 && html` <${Badge} kind="warn">${of.waiting} waiting, the oldest for ${duration(of.oldest_s)}<//>`}</p>
     <p class="quiet">Told when: ${of.kinds.length === Object.keys(EVENTS).length ? "anything below happens" : of.kinds.map((kind) => EVENTS[kind] ?? kind).join("; ")}.</p>
     ${able && html`<div class="row"><${Action} busy=${sending} onClick=${send}>Send a test notice<//>
       ${!of.fixed && html`<${Action} busy=${removing} onClick=${remove}>Remove<//>`}</div>`}

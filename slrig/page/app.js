@@ -44,7 +44,7 @@ function Page() {
   return html`
     ${lost && html`<div class="lost" role="alert">The service does not answer. The page tries again by itself; nothing that the service has begun is lost.</div>`}
     ${(session === "none" || session?.over) && html`<${LogIn} over=${session.over} done=${enter} />`}
-    ${session?.scopes && html`<div hidden=${session.over}><${Rooms} session=${session} left=${() => setSession("none")} /></div>`}
+    ${session?.scopes && html`<div class="rooms" hidden=${session.over}><${Rooms} session=${session} left=${() => setSession("none")} /></div>`}
     ${session === null && html`<p class="wait">Asking the service …</p>`}`;
 }
 

@@ -46,7 +46,7 @@ function Attention({service}) {
   return html`<section class="refusal" role="alert" aria-label="To be looked at"><ul class="findings">
     ${wrong.map(([name, found]) => html`<li><${Badge} kind="bad">${CHECKS[name] ?? name}<//> ${found}</li>`)}
     ${damaged.map(([kind, amount]) => html`<li><${Badge} kind="warn">Damaged<//> ${amount} ${kind}${amount > 1 ? "s" : ""}: record or files are gone or were changed.
-      <p><strong>What to do:</strong> bring the files back from a backup, or delete ${amount > 1 ? "them" : "it"} where the others of its kind are listed.</p></li>`)}
+      <p><strong>What to do:</strong> Bring the files back from a backup, or delete ${amount > 1 ? "them" : "it"} where the others of its kind are listed.</p></li>`)}
   </ul></section>`;
 }
 

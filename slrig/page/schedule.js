@@ -140,7 +140,7 @@ function Calendar({runs, more, upcoming, name}) {
 /** What a run found, in words. */
 function found(result) {
   if (!result) return null;
-  if (result.verification) return `The calibration is ${result.state}: ${result.reasons.join("; ")}`;
+  if (result.verification) return `The calibration is ${result.state === "watch" ? "to be watched" : result.state}: ${result.reasons.join("; ")}`;
   if (result.acceptance) return `The acceptance test: ${result.decision}`;
   if (result.scan) return `${count(result.points)} points`;
   return `${result.accepted} of ${result.poses} poses taken. ${result.verdict ?? ""} ${result.activated ? "In use" : `Not in use${result.left_to_a_person.length ? `, left to a person: ${result.left_to_a_person.join("; ")}` : ""}`}`;

@@ -33,7 +33,7 @@ export function Trend({title, points, limits}) {
   return html`<figure class="chart" ref=${frame}><figcaption>${title}</figcaption>
     <svg viewBox=${`0 0 ${width} ${TOP + HEIGHT + BELOW}`} role="img" aria-label=${`${title}: ${points.length} verifications, the last ${number(points.at(-1).value)}. The table below has the figures.`}>
       ${Array.from({length: Math.floor(most / step) + 1}, (_, at) => html`<path class="grid" d=${`M${LEFT} ${y(at * step)}H${width - RIGHT}`} /><text x=${LEFT - 6} y=${y(at * step) + 4} text-anchor="end">${number(at * step)}</text>`)}
-      ${near.map(([value, words, kind]) => html`<path class=${`limit ${kind}`} d=${`M${LEFT} ${y(value)}H${width - RIGHT}`} /><text class=${kind} x=${width - RIGHT} y=${y(value) - 4} text-anchor="end">${words}</text>`)}
+      ${near.map(([value, words, kind]) => html`<path class=${`limit ${kind}`} d=${`M${LEFT} ${y(value)}H${width - RIGHT}`} /><text class=${kind} x=${LEFT + 4} y=${y(value) - 4}>${words}</text>`)}
       <path class="line" d=${`M${points.map(({at, value}) => `${x(at).toFixed(1)} ${y(value).toFixed(1)}`).join("L")}`} />
       ${points.map(({at, value, kind, words}) => html`<circle class=${kind} cx=${x(at)} cy=${y(value)} r="4"><title>${day(at)}: ${number(value)}. ${words}</title></circle>`)}
       <text x=${x(first)} y=${TOP + HEIGHT + 18} text-anchor=${last > first ? "start" : "middle"}>${day(first)}</text>
