@@ -32,6 +32,7 @@ from slrig.doctor import (
     with_synchronisation,
 )
 from slrig.errors import ConfigError, RigFileChangedError, SlrigError, StorageError
+from slrig.jobs.listener import Listener
 from slrig.jobs.records import Holder, JobKind
 from slrig.rig.session import RigSession
 
@@ -159,7 +160,7 @@ def _change(service: Service, text: str, *, version: str | None) -> None:
         if version is not None:
             _replace(path, text, version=version)
 
-    def use(rig: RigSession, _cancelled: Callable[[], bool]) -> None:
+    def use(rig: RigSession, _listener: Listener) -> None:
         try:
             rig.reopen(partial(open_rig, config), kept)
         except SlrigError as error:

@@ -99,7 +99,7 @@ def test_what_the_page_measures_lies_within_two_sigma_of_the_truth(tmp_path: Pat
         text = text.replace(small, large)
     rig_file.write_text(text)
     with open_rig(read_rig(rig_file)) as rig:
-        capture_frames(rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False).finish()
+        capture_frames(rig, ScanPlan(), tmp_path / "bundle").finish()
     reconstructed(tmp_path / "bundle", tmp_path / "out")
     mesh = decode_mesh_ply((tmp_path / "out" / "mesh.ply").read_bytes())
     (tmp_path / "view.glb").write_bytes(encode_view_glb(mesh))
