@@ -310,7 +310,7 @@ def of_a_code(camera: Pinhole, rows: FloatArray) -> PixelPairs:
 
 def pair_check(second: Pinhole, rows: FloatArray, *, is_mirrored: bool = False) -> CalibrationCheck:
     """Test a second camera, as the calibration has it, by pictures that it mirrored left to right, or not."""
-    first, other = of_a_code(CAMERA, np.arange(10, 70) + 0.5), of_a_code(SECOND, rows)
+    first, other = of_a_code(CAMERA, np.arange(10.0, 70.0, dtype=np.float64) + 0.5), of_a_code(SECOND, rows)
     if is_mirrored:
         other = replace(other, camera_px=mirrored(other))
     check = check_calibration(CAMERA, second, find_camera_pairs(first, other, (CAMERA, second)), (), names=NAMES)
@@ -337,7 +337,7 @@ def test_two_cameras_that_agree_need_no_calibrated_projector(rows: FloatArray) -
 def test_two_cameras_refute_a_wrong_calibration_and_name_its_mistake(
     second: Pinhole, *, is_mirrored: bool, words: str
 ) -> None:
-    found = pair_check(second, np.arange(80) + 0.5, is_mirrored=is_mirrored)
+    found = pair_check(second, np.arange(80.0, dtype=np.float64) + 0.5, is_mirrored=is_mirrored)
     assert found.is_refuted
     assert words in found.cause
     assert "projector" not in found.cause
