@@ -7,7 +7,6 @@ told. No formula of any reconstruction enters: only the renderer, the sensor and
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -96,10 +95,8 @@ class StripeBound:
         return np.asarray(self.row_px / np.sqrt(rows), np.float64)
 
 
-def stripe_bound(
-    exposed: ExposedView, profile: Pixels, lines_px: FloatArray, /, *, ends_repeats: float | None = None
-) -> StripeBound:
-    """State the Cramér-Rao bound of the stripes of one line pattern, per image row.
+def stripe_bound(exposed: ExposedView, profile: Pixels, lines_px: FloatArray, /) -> StripeBound:
+    """State the Cramér-Rao bound of the stripes of one line pattern, per image row; albedo and room light are known.
 
     The Fisher information of one row about the projector column c of a line is the sum of (∂I/∂c)² / s²(I) over the
     pixels that are nearer to this line than to its neighbours; Rao (1945), Kay, "Fundamentals of Statistical Signal
@@ -113,10 +110,6 @@ def stripe_bound(
     lines_px
         (m,) float64, ascending: the centres of its lines. Bounds come for these; a line cut by the border is left out
         by not naming it.
-    ends_repeats
-        None: the bound of the line frame alone, the albedo and the light of the room being known. A number: they are
-        known from so many white and black frames, pixel by pixel, and the noise of those counts:
-        s² = s²(I) + (l² s²(white) + (1 - l)² s²(black)) / repeats, l = (I - black) / (white - black).
 
     Returns
     -------
@@ -124,13 +117,9 @@ def stripe_bound(
         Crossings beside a shadow, a depth step or the image's border are left out. Clipped samples tell nothing.
     """
     mean, per_column = _light_and_change(exposed, profile)
-    white, black = exposed.ends
+    _, black = exposed.ends
     variance = exposed.variance_e2(mean)
     own = mean - black
-    if ends_repeats is not None:
-        light = own / np.maximum(white - black, 1e-9)
-        ends = light**2 * exposed.variance_e2(white) + (1.0 - light) ** 2 * exposed.variance_e2(black)
-        variance = variance + ends / ends_repeats
     column = exposed.view.truth().projector_px[..., 0]
     pixels = _Own.of(column, np.asarray(lines_px, np.float64))
     noise = variance[pixels.rows, pixels.columns]
@@ -160,29 +149,6 @@ def stripe_bound(
         row_px=(along_c / steepness)[kept],
         row_known_px=(known_c / steepness)[kept],
     )
-
-
-def pixel_bound(exposed: ExposedView, profiles: Sequence[Pixels], /) -> tuple[FloatArray, FloatArray]:
-    """State the bound of the projector column at each camera pixel, from its own samples in several frames.
-
-    A reconstruction that reads its stripes in the light of all line frames may come below the bound of a single
-    frame's stripe; not below this one, over the square root of the number of pixels whose samples it takes the mean of.
-
-    profiles : (1, Wp) uint8 each, the line patterns, all shifts.
-    Returns two (H, W) float64, in projector columns: with the pixel's albedo and room light unknown, and with both
-    known. NaN where the projector does not light the pixel's centre or the samples do not tell.
-    """
-    black = exposed.ends[1]
-    lit = np.isfinite(exposed.view.truth().projector_px[..., 0])
-    fisher = np.zeros((int(lit.sum()), 3, 3))
-    for profile in profiles:
-        mean, per_column = _light_and_change(exposed, profile)
-        noise = exposed.variance_e2(mean)[lit]
-        changes = np.stack([per_column[lit], (mean - black)[lit], np.ones(len(fisher))], axis=1)
-        fisher += changes[:, :, None] * (changes / noise[:, None])[:, None, :]
-    unknown, known = np.full((2, *lit.shape), np.nan)
-    unknown[lit], known[lit] = _deviations(fisher)
-    return unknown, known
 
 
 def _moved(table: LightTable, nodes: int) -> LightTable:

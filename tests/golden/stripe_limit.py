@@ -27,7 +27,7 @@ from slrig.patterns.sequence import encode, scan_patterns
 from slrig.reconstruction.decoded_image import CodeTables, ReconstructionLimits
 from slrig.reconstruction.frames import axis_frames
 from slrig.reconstruction.pipeline import CameraCurves, camera_curves
-from tests.light_bound import ExposedView, pixel_bound, stripe_bound
+from tests.light_bound import ExposedView, stripe_bound
 from tests.unit.reconstruction.builders import rms
 
 PLANE: Mapping[str, object] = {"shape": "plane", "size_mm": [240.0, 240.0], "rotation_deg": [8.0, -12.0, 0.0]}
@@ -122,7 +122,6 @@ class Points:
     error_px : (n,) float64, from the true line, across it, towards rising columns; cell : (n,) its cell.
     stated_px : (n,) the deviation that the reconstruction states.
     snr, bound_px : (n,) of the stripe there: its signal to noise, and its bound averaged along the stripe.
-    pixel_px : (n,) the bound of the pixel that the point lies in, from its samples in all line frames.
     """
 
     error_px: FloatArray
@@ -130,7 +129,6 @@ class Points:
     stated_px: FloatArray
     snr: FloatArray
     bound_px: FloatArray
-    pixel_px: FloatArray
 
     @property
     def _mean_px(self) -> FloatArray:
@@ -161,45 +159,33 @@ class Points:
         """Rms of the error over its bound: of the line frame alone, averaged along the stripe."""
         return rms(self.error_px / self.bound_px)
 
-    @property
-    def pixels_worth(self) -> float:
-        """How many pixels' samples in all line frames, averaged without loss, would scatter as the points do."""
-        scatter = self.scatter_px / self.pixel_px[self._freedom > 0]
-        return float(1.0 / np.nanmean(scatter**2))
-
 
 def measured(rig: Rig, exposed: ExposedView, *, captures: int, seed: int = 1) -> Points:
     """Reconstruct noisy captures of one scene, and find the error and the bound of every point."""
     rows = rig.camera.size.height_px
     bounds = _bounds(rig, exposed)
     means = [exposed.electrons(profile) for profile in rig.sequence.profiles]
-    pixel_columns, _ = pixel_bound(exposed, [rig.sequence.profiles[index] for index, _ in rig.lines()])
     rng = np.random.default_rng(seed)
-    errors, pixels, stated, cells = [], [], [], []
+    errors, stated, cells = [], [], []
     for _ in range(captures):
         curves = _curves(rig, exposed, means, rng)
         points = curves.ensemble.points_px
         line = np.repeat(curves.ensemble.position_px, np.diff(curves.ensemble.offsets))
-        error, columns_per_px = _errors_px(rig, points, line)
-        errors.append(error)
-        at_column, at_row = np.rint(points).astype(np.intp).T
-        pixels.append(pixel_columns[at_row, at_column] / columns_per_px)
+        errors.append(_errors_px(rig, points, line))
         cells.append(np.rint(line).astype(np.intp) * rows + np.rint(points[:, 1]).astype(np.intp))
         stated.append(curves.ensemble.sigma_px)
-    error, pixel = np.concatenate(errors), np.concatenate(pixels)
-    cell, deviation = np.concatenate(cells), np.concatenate(stated)
+    error, cell, deviation = np.concatenate(errors), np.concatenate(cells), np.concatenate(stated)
     known = np.isfinite(error) & np.isfinite(bounds["bound_px"][cell])
-    error, pixel, cell, deviation = error[known], pixel[known], cell[known], deviation[known]
-    return Points(error, cell, deviation, bounds["snr"][cell], bounds["bound_px"][cell], pixel)
+    error, cell, deviation = error[known], cell[known], deviation[known]
+    return Points(error, cell, deviation, bounds["snr"][cell], bounds["bound_px"][cell])
 
 
-def _errors_px(rig: Rig, points_px: FloatArray, line_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distance of points from their true lines, px, and projector columns per px there; (n,) float64 each."""
+def _errors_px(rig: Rig, points_px: FloatArray, line_px: FloatArray) -> FloatArray:
+    """(n,) float64: distance of points from their true lines, px."""
     here, right, left, below, above = (
         rig.columns_at(points_px + np.array(step)) for step in ((0, 0), (0.25, 0), (-0.25, 0), (0, 0.25), (0, -0.25))
     )
-    columns_per_px = 2.0 * np.hypot(right - left, below - above)
-    return np.asarray((here - line_px) / columns_per_px), np.asarray(columns_per_px)
+    return np.asarray((here - line_px) / (2.0 * np.hypot(right - left, below - above)))
 
 
 def _curves(rig: Rig, exposed: ExposedView, means: list[NDArray[np.float32]], rng: np.random.Generator) -> CameraCurves:
