@@ -323,15 +323,15 @@ def judge_calibration(
 def _summary(grade: Grade, expected: ExpectedError | None, tolerance_mm: float, count: int) -> str:
     error = ""
     if expected is not None and np.isfinite(expected.point_mm) and expected.point_mm > 0:
-        limit = ", by the size of the board most of all" if _limited_by_board(expected) else ""
+        limit = ", mostly from the board's size" if _limited_by_board(expected) else ""
         error = (
-            f": {expected.point_description} is expected within {expected.point_mm:.2g} mm"
+            f": the expected error of {expected.point_description} is {expected.point_mm:.2g} mm"
             f"{expected.direction_description} (1 in {_diagonal_mm(expected) / expected.point_mm:,.0f}{limit})"
         )
     single = expected is not None and expected.across
     note = "; it cannot scan alone: that takes a projector or a second camera, calibrated with it" if single else ""
     if grade is Grade.GOOD:
-        return f"good{error}; twice that is within the wanted {tolerance_mm:.2g} mm{note}"
+        return f"good{error}, within the limit of {tolerance_mm / _SIGMAS:.2g} mm{note}"
     return f"{grade.label}{error}; {count} thing{'s' if count > 1 else ''} to look at{note}"
 
 

@@ -2,7 +2,7 @@
 import {html, useRef, useState} from "./vendor/preact-htm.js";
 import {Poses, Shooting} from "./poses.js";
 import {ask, useAction, useValue} from "./service.js";
-import {Action, Badge, Choice, Confirm, Facts, Field, Refusal, length, moment} from "./ui.js";
+import {Action, Badge, Choice, Confirm, Facts, Field, Refusal, begun, length, moment} from "./ui.js";
 
 const USUAL = {kind: "charuco", columns: "11", rows: "8", square: "12", marker: "", dictionary: "", across: "", down: ""};
 const KINDS = [["charuco", "ChArUco"], ["chessboard", "Chessboard"], ["circles", "Circles"]];
@@ -24,8 +24,8 @@ function Calibrations({rig, able}) {
   const all = list?.calibrations ?? [];
   const active = all.find((each) => each.active);
   const used = active ? html`Scans use <a href=${`#/calibrate/${active.id}`}>${nameOf(active)}</a>.`
-    : rig?.calibrated ? "Scans use the calibration that the rig brings along."
-      : rig?.calibrated === false ? "The rig has no calibration yet: a scan would have no millimetres." : "The rig is not open yet.";
+    : rig?.calibrated ? "Scans use the rig file's calibration."
+      : rig?.calibrated === false ? "This rig is not calibrated. Calibrate it before you scan." : "The rig is being opened.";
   return html`<div class="two">
     <section aria-labelledby="new"><h2 id="new">New calibration</h2><${Opening} able=${able} /></section>
     <section aria-labelledby="kept"><h2 id="kept">Calibrations</h2>
@@ -36,7 +36,7 @@ function Calibrations({rig, able}) {
       <ul class="cards">${all.map((each) => html`<li key=${each.id}><a class="card" href=${`#/calibrate/${each.id}`}>
         <span class="between"><strong>${nameOf(each)}</strong><${States} of=${each} /></span>
         <span class="quiet">${each.imported ? "imported" : `${each.poses} poses`}, ${moment(each.solved_at ?? each.created_at)}</span>
-        ${each.verdict && html`<span class="clip">${each.verdict}</span>`}
+        ${each.verdict && html`<span class="clip">${begun(each.verdict)}.</span>`}
       </a></li>`)}</ul>
       <${Importing} able=${able} />
     </section>
@@ -151,11 +151,12 @@ function Solved({session, rig, looked, able, again}) {
   });
   return html`<section class="box" aria-labelledby="verdict"><h2 id="verdict">${verdict ? "What the solve says" : "What the file holds"}</h2>
     ${session.state === "open" && verdict && html`<p class="warning">The poses were changed since. Solve again to have the new ones counted.</p>`}
-    ${verdict && html`<p class=${`judged ${kind}`} role="status"><span aria-hidden="true">${sign} </span>${verdict.summary}</p>`}
+    ${verdict && html`<p class=${`judged ${kind}`} role="status"><span aria-hidden="true">${sign} </span>${begun(verdict.summary)}.</p>`}
     <${Lines} of=${verdict?.reasons} />
     ${!session.active && html`<${Lines} words="Before scans use it:" of=${verdict?.unattended} />`}
+    ${limited(session) && html`<${Measuring} key=${session.id} session=${session} able=${able} again=${again} />`}
     <div class="row">${session.active
-      ? html`<${Action} key="stop" busy=${busy} disabled=${!able} onClick=${() => use("deactivate")}>Stop using it<//><span>Scans use it. Without it they use what the rig brings along, if that is anything.</span>`
+      ? html`<${Action} key="stop" busy=${busy} disabled=${!able} onClick=${() => use("deactivate")}>Stop using it<//><span>In use. If you stop using it, scans fall back to the rig file's calibration, if there is one.</span>`
       : html`<${Action} key="use" kind="primary" busy=${busy} disabled=${!able} onClick=${() => use("activate")}>Use it<//><span>Scans use it from the next one on, after a restart too.</span>`}</div>
     <${Refusal} problem=${refused} />
     ${!session.active && rig?.calibration?.id && html`<${Comparing} key=${rig.calibration.id} active=${rig.calibration.id} id=${session.id} />`}
@@ -163,6 +164,31 @@ function Solved({session, rig, looked, able, again}) {
     <p class="row">${Object.entries(links.files).toReversed().map(([name, path]) => name === "report.html" ? html`<a href=${path} target="_blank" rel="noopener">Report with pictures</a>` : html`<a href=${path} download=${name}>${name}</a>`)}</p>
     <details hidden=${!verdict?.remarks.length}><summary>Remarks</summary><${Lines} of=${verdict?.remarks} /></details>
   </section>`;
+}
+
+/** Whether the size of a board that nobody measured is most of the error. */
+const limited = ({board, result}) => board && !board.measured && 2 * result?.expected.board_mm ** 2 > result?.expected.point_mm ** 2;
+
+function Measuring({session, able, again}) {
+  const [across, setAcross] = useState("");
+  const [down, setDown] = useState("");
+  const [solve, busy, problem] = useAction(async () => {
+    await ask("POST", session.links.solve, {body: {measured_mm: [Number(across), Number(down)]}});
+    await again();
+  });
+  const submit = (event) => {
+    event.preventDefault();
+    solve();
+  };
+  const [below, beside] = session.board.rulers_mm;
+  return html`<form class="box" onSubmit=${submit}>
+    <p><strong>The board's size has not been measured</strong>, and is most of the error: ${length(session.result.expected.board_mm)}. Hold a steel ruler to the two printed scales, from the first to the last tick.</p>
+    <div class="row numbers">
+      <${Field} label=${`Scale below, printed ${below} mm`} value=${across} change=${setAcross} required />
+      <${Field} label=${`Scale on the left, printed ${beside} mm`} value=${down} change=${setDown} required />
+      <button class="action" type="submit" aria-busy=${busy} disabled=${busy || !able}>Solve with these</button>
+    </div>
+    <${Refusal} problem=${problem} /></form>`;
 }
 
 const Lines = ({words, of}) => of?.length > 0 && html`${words && html`<p>${words}</p>`}<ul>${of.map((each) => html`<li>${each}</li>`)}</ul>`;

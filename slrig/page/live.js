@@ -1,79 +1,163 @@
-// The live picture of a camera, and what it says of the exposure.
+// The live picture of a camera: there at once while somebody looks and the rig is free, with what it says of light and focus.
 import {html, useEffect, useRef, useState} from "./vendor/preact-htm.js";
-import {Action, Choice, percent} from "./ui.js";
+import {Opening, holderWords} from "./ready.js";
+import {Choice} from "./ui.js";
 
-/** What a camera sees while nobody scans. Looking takes the rig between scans, so it is asked for, never begun by itself. Without `setBracket` nothing is said of the exposure. `aim`: where a board goes next, as a calibration says it. */
-export function Live({rig, may, bracket, setBracket, aim}) {
-  const [camera, setCamera] = useState(null);
+const KEPT = "live";
+const OFF = "";
+const AGAIN_MS = 3000;
+/** So long without a key or a pointer nobody looks: the projector would be lit all night. */
+const AWAY_MS = 10 * 60 * 1000;
+
+/** Whether somebody looks at this page: its tab is to be seen, and a hand has moved within some minutes. */
+function useLooking() {
+  const [looking, setLooking] = useState(!document.hidden);
+  useEffect(() => {
+    let moved = Date.now();
+    const look = () => setLooking(!document.hidden && Date.now() - moved < AWAY_MS);
+    const move = () => {
+      moved = Date.now();
+      look();
+    };
+    const kinds = ["pointermove", "pointerdown", "keydown", "visibilitychange"];
+    kinds.forEach((kind) => document.addEventListener(kind, move));
+    const timer = setInterval(look, 1000);
+    return () => {
+      kinds.forEach((kind) => document.removeEventListener(kind, move));
+      clearInterval(timer);
+    };
+  }, []);
+  return looking;
+}
+
+/**
+ * What a camera sees while nobody scans. `aim`: where a board goes next, as a calibration says it. `plain`: nothing is
+ * marked. `exposure_s`: of the picture; null is the rig file's. `told(figures)` is called each second with what the picture says, see `measured`, and
+ * with null when it is over.
+ */
+export function Live({rig, may, aim, plain = false, exposure_s = null, told}) {
+  const [chosen, setChosen] = useState(() => sessionStorage.getItem(KEPT));
   const [light, setLight] = useState("white");
   const [failed, setFailed] = useState(false);
-  const image = useRef();
+  const running = useRef(null);
+  const looking = useLooking();
   const names = rig?.cameras.map((each) => each.name) ?? [];
-  const seen = camera !== null && names.includes(camera) ? camera : null;
-  if (!may("scan")) return html`<p class="quiet">A key for scans shows the live picture.</p>`;
-  const {size_px} = rig?.cameras.find((each) => each.name === seen) ?? {};
-  const outline = aim?.camera === seen && aim?.outline_px.length ? aim.outline_px : null;
+  const camera = chosen === OFF ? null : [chosen, aim?.camera, names[0]].find((name) => names.includes(name)) ?? null;
+  const stream = camera && `/preview/${encodeURIComponent(camera)}?${new URLSearchParams({light, marks: String(!plain), ...(exposure_s ? {exposure_s} : {})})}`;
+  useEffect(() => {
+    if (!failed) return undefined;
+    const timer = setTimeout(() => setFailed(false), AGAIN_MS);
+    return () => clearTimeout(timer);
+  }, [failed]);
+  if (!may("scan")) return html`<p class="live none">A key with the scope “scan” shows the live picture.</p>`;
+  const absent = !rig ? "Asking the service …" : rig.error ? `No picture comes: ${rig.error}` : !rig.open ? html`<${Opening} rig=${rig} />`
+    : camera === null ? "The live picture is off." : !looking ? "Paused, because nobody looks. Move the pointer to go on."
+      : failed ? "No picture comes. It is tried again by itself." : rig.holder && running.current !== stream ? `${holderWords(rig)} The picture comes when it is free.` : null;
+  const {size_px} = rig?.cameras.find((each) => each.name === camera) ?? {};
+  const aimed = !absent && aim?.camera === camera && aim?.outline_px?.length ? aim : null;
+  const choose = (name) => {
+    sessionStorage.setItem(KEPT, name);
+    setChosen(name);
+    setFailed(false);
+  };
   return html`
+    ${absent ? html`<div class="live none" role=${failed ? "alert" : null}>${absent}</div>`
+      : html`<div class="aimed"><${Picture} key=${stream} stream=${stream} camera=${camera} running=${running} told=${told} failed=${() => setFailed(true)} />
+        ${aimed && html`<${Aim} aim=${aimed} size_px=${size_px} />`}</div>`}
     <div class="row">
-      <${Choice} label="Camera" value=${seen} options=${[[null, "Off"], ...names.map((name) => [name, name])]} chosen=${(name) => { setCamera(name); setFailed(false); }} />
-      ${seen && html`<${Choice} label="Projector" value=${light} options=${[["white", "White light"], ["off", "Dark"]]} chosen=${setLight} />`}
-    </div>
-    ${!seen && html`<p class="live none">Choose a camera to see what it sees.</p>`}
-    ${seen && failed && html`<p class="live none" role="alert">No picture comes. ${rig.error ?? "Choose the camera again to try once more."}</p>`}
-    ${seen && !failed && html`<div class="aimed"><${Picture} key=${`${seen} ${light}`} image=${image} camera=${seen} light=${light} failed=${() => setFailed(true)} />
-        ${outline && html`<svg viewBox=${`0 0 ${size_px.join(" ")}`} aria-hidden="true"><polygon points=${outline.join(" ")} /><circle cx=${outline[0][0]} cy=${outline[0][1]} r=${size_px[0] / 60} /></svg>`}</div>
-      <p class="legend">${outline && html`<span><span class="swatch aim"></span> the board goes here, its upper left corner to the dot</span>`}<span class="swatch saturated"></span>saturated <span class="swatch dark"></span>too dark ${rig.holder && " · waits while the rig is held"}</p>
-      ${light === "white" && setBracket && html`<${Exposure} image=${image} camera=${rig.cameras.find((each) => each.name === seen)} bracket=${bracket} setBracket=${setBracket} />`}`}`;
+      ${names.length > 0 && html`<${Choice} label="Camera" value=${camera ?? OFF} options=${[...names.map((name) => [name, name]), [OFF, "Off"]]} chosen=${choose} />`}
+      ${camera && !absent && html`<${Choice} label="Projector" value=${light} options=${[["white", "White light"], ["off", "Dark"]]} chosen=${setLight} />`}
+      ${!absent && html`<span class="legend">${aimed && html`<span><span class="swatch aim"></span> The board goes here, its upper left corner to the dot.</span>`}
+        ${!plain && html`<span><span class="swatch saturated"></span> saturated</span>`}${!plain && light === "white" && html`<span><span class="swatch dark"></span> too dark</span>`}${rig.holder && html`<span>Waits while the rig is in use.</span>`}</span>`}
+    </div>`;
 }
 
-function Picture({image, camera, light, failed}) {
-  // A picture that is no more shown would go on loading, and the projector would stay lit.
+function Picture({stream, camera, running, told, failed}) {
+  const image = useRef();
   useEffect(() => {
     const shown = image.current;
-    return () => shown.removeAttribute("src");
+    running.current = stream;
+    const timer = setInterval(() => {
+      const found = measured(shown);
+      if (found) told?.({camera, ...found});
+    }, 1000);
+    // A picture that is no more shown would go on loading, and the projector would stay lit.
+    return () => {
+      clearInterval(timer);
+      running.current = null;
+      told?.(null);
+      shown.removeAttribute("src");
+    };
   }, []);
-  return html`<img class="live" ref=${image} src=${`/preview/${encodeURIComponent(camera)}?light=${light}&marks=true`}
-    alt=${`Live picture of camera ${camera}`} onError=${failed} />`;
+  return html`<img class="live" ref=${image} src=${stream} alt=${`Live picture of camera ${camera}`} onError=${failed} />`;
 }
 
-/** Of the picture: less is a highlight or two. */
-const LEAST_SATURATED = 0.002;
-/** Two exposures this many times apart share two thirds of the range of 8 bits. */
-const STEP = 4;
+const middle = (points) => [0, 1].map((axis) => points.reduce((sum, point) => sum + point[axis], 0) / points.length);
 
-/** What the marks in the live picture say of the exposure, and a bracket where one exposure cannot do. */
-function Exposure({image, camera, bracket, setBracket}) {
-  const [shares, setShares] = useState(null);
-  useEffect(() => {
-    const timer = setInterval(() => setShares(marked(image.current)), 1000);
-    return () => clearInterval(timer);
-  }, [camera.name]);
-  if (!shares) return null;
-  const now_s = camera.exposure_s;
-  const shorter_s = now_s / STEP;
-  const proposed = shares.saturated > LEAST_SATURATED && shorter_s >= camera.exposure_range_s[0] ? [shorter_s, now_s] : null;
-  return html`<p>${percent(shares.saturated)} saturated, ${percent(shares.dark)} too dark or in shadow${now_s ? `, at ${milliseconds(now_s)}` : ""}.
-    ${!bracket && proposed && html` <${Action} onClick=${() => setBracket(proposed)}>Scan with ${proposed.map(milliseconds).join(" and ")}<//>`}
-    ${bracket && html` Each scan takes ${bracket.map(milliseconds).join(" and ")}. <${Action} onClick=${() => setBracket(null)}>One exposure again<//>`}</p>`;
+/** The outline that the board is to fill, and an arrow to it from where the board was shot last. */
+function Aim({aim, size_px}) {
+  const [width, height] = size_px;
+  const unit = width / 100;
+  const outline = aim.outline_px;
+  const to = middle(outline);
+  const from = aim.from_px ?? null;
+  const way = from && Math.hypot(to[0] - from[0], to[1] - from[1]);
+  const along = way && [0, 1].map((axis) => (to[axis] - from[axis]) / way);
+  const at = (back, aside) => [to[0] - along[0] * back - along[1] * aside, to[1] - along[1] * back + along[0] * aside].join(",");
+  return html`<svg viewBox=${`0 0 ${width} ${height}`} aria-hidden="true">
+    <polygon points=${outline.join(" ")} /><circle cx=${outline[0][0]} cy=${outline[0][1]} r=${1.7 * unit} />
+    ${way > 5 * unit && html`<path d=${`M${from.join(",")}L${at(3 * unit, 0)}`} /><path class="head" d=${`M${to.join(",")}L${at(5 * unit, 2.5 * unit)}L${at(5 * unit, -2.5 * unit)}Z`} />`}
+  </svg>`;
 }
 
-const milliseconds = (seconds) => `${Number((1000 * seconds).toPrecision(3))} ms`;
+export const LEVELS = 64;
+const WIDE_PX = 240;
+/** The middle of the picture as it came, in which fine detail tells the focus. */
+const SHARP_PX = 256;
 
-/** Shares of a picture's pixels that are marked as saturated (red) and as too dark (blue); null before there is one. */
-function marked(image) {
-  if (!image?.naturalWidth) return null;
-  const canvas = document.createElement("canvas");
-  canvas.width = 240;
-  canvas.height = Math.max(1, Math.round((240 * image.naturalHeight) / image.naturalWidth));
-  const context = canvas.getContext("2d", {willReadFrequently: true});
-  context.imageSmoothingEnabled = false;
-  context.drawImage(image, 0, 0, canvas.width, canvas.height);
-  const {data} = context.getImageData(0, 0, canvas.width, canvas.height);
+/**
+ * What a marked picture says: shares of its pixels that are saturated (red) and too dark (blue), `levels` of brightness
+ * (shares, from dark to bright), and `sharpness`, the contrast from pixel to pixel in its middle. null before there is one.
+ */
+function measured(image) {
+  if (!image.naturalWidth) return null;
+  const {naturalWidth: width, naturalHeight: height} = image;
+  const part = Math.min(SHARP_PX, width, height);
+  const whole = pixelsOf(image, [0, 0, width, height], WIDE_PX, Math.max(1, Math.round((WIDE_PX * height) / width)));
+  const near = pixelsOf(image, [(width - part) / 2, (height - part) / 2, part, part], part, part);
+  const levels = new Array(LEVELS).fill(0);
   let saturated = 0;
   let dark = 0;
-  for (let at = 0; at < data.length; at += 4) {
-    if (data[at] > data[at + 1] + 80) saturated += 1;
-    if (data[at + 2] > data[at + 1] + 60) dark += 1;
+  for (let at = 0; at < whole.length; at += 4) {
+    const [red, green, blue] = [whole[at], whole[at + 1], whole[at + 2]];
+    const burnt = red > green + 80;
+    const unlit = !burnt && blue > green + 60;
+    saturated += burnt;
+    dark += unlit;
+    levels[burnt ? LEVELS - 1 : unlit ? 0 : Math.floor((green * LEVELS) / 256)] += 1;
   }
-  return {saturated: (4 * saturated) / data.length, dark: (4 * dark) / data.length};
+  const count = whole.length / 4;
+  return {saturated: saturated / count, dark: dark / count, levels: levels.map((each) => each / count), sharpness: sharpness(near, part)};
+}
+
+function pixelsOf(image, from, width, height) {
+  const canvas = Object.assign(document.createElement("canvas"), {width, height});
+  const context = canvas.getContext("2d", {willReadFrequently: true});
+  context.imageSmoothingEnabled = false;
+  context.drawImage(image, ...from, 0, 0, width, height);
+  return context.getImageData(0, 0, width, height).data;
+}
+
+/** Mean difference of the next pixel but one, over the mean brightness: large where edges are sharp, whatever the exposure. */
+function sharpness(pixels, size) {
+  let differences = 0;
+  let light = 1;
+  for (let row = 0; row < size - 2; row += 1) {
+    for (let column = 0; column < size - 2; column += 1) {
+      const at = 4 * (row * size + column) + 1;
+      differences += (pixels[at + 8] - pixels[at]) ** 2 + (pixels[at + 8 * size] - pixels[at]) ** 2;
+      light += pixels[at] ** 2;
+    }
+  }
+  return Math.sqrt(differences / light);
 }

@@ -2,7 +2,7 @@
 import {html, useEffect, useRef, useState} from "./vendor/preact-htm.js";
 import {Live} from "./live.js";
 import {ask, follow, once, useAction} from "./service.js";
-import {Action, Badge, Choice, JobBadge, Progress, Refusal, percent} from "./ui.js";
+import {Action, Badge, Choice, JobBadge, Progress, Refusal, begun, percent} from "./ui.js";
 
 const over = (pose) => !["queued", "capturing", "computing"].includes(pose.state);
 const WAITS_S = [3, 5, 10, 20];
@@ -14,8 +14,6 @@ function outcome(pose) {
   return pose.state === "cancelled" ? ["warn", "–", "stopped"] : ["bad", "✗", "failed"];
 }
 
-const sentence = (text) => `${text[0].toUpperCase()}${text.slice(1)}`;
-
 /** What to do with the board now: [in a few words, why]. */
 function instruction(session, pose) {
   if (session.state === "solving") return ["Solving …", null];
@@ -26,7 +24,7 @@ function instruction(session, pose) {
   const {words} = session.next_move;
   const cut = words.indexOf(": ");
   const [first, why] = cut < 0 ? [words, null] : [words.slice(0, cut), words.slice(cut + 2)];
-  return [`${sentence(first)}.`, why && `${sentence(why)}.`];
+  return [`${begun(first)}.`, why && `${begun(why)}.`];
 }
 
 export function Shooting({session, rig, able, may, again}) {
@@ -90,7 +88,8 @@ export function Shooting({session, rig, able, may, again}) {
 
   const progress = told ?? session.progress;
   const ready = able && idle;
-  return html`<div class="two"><section class="box" aria-label="Shooting" ref=${place}>
+  return html`<div class="two"><section aria-label="Live picture"><${Live} plain rig=${rig} may=${may} aim=${pose ? null : session.next_move} /></section>
+  <div><section class="box" aria-label="Shooting" ref=${place}>
     ${session.state === "solved" && html`<p class="quiet">More poses make it better:</p>`}
     ${timer.running && html`<p class="count" role="timer">${timer.left ?? "…"}</p>`}
     <p class="say" role="status">${words}</p>
@@ -103,17 +102,14 @@ export function Shooting({session, rig, able, may, again}) {
       ${timer.running ? html`<${Action} key="stop" kind="danger" onClick=${timer.stop}>Stop the timer (any key)<//>`
         : html`<${Action} key="start" disabled=${!ready} onClick=${() => { tone.allow(); timer.start(); }}>Shoot every ${timer.every_s} s<//>`}
       <${Choice} label="Seconds to move the board" value=${timer.every_s} options=${WAITS_S.map((each) => [each, `${each} s`])} chosen=${timer.setEvery} />
-      ${rig?.positions.length > 0 && html`<${Action} disabled=${!ready} busy=${beginning} onClick=${script}>Shoot all ${rig.positions.length} of the positioner<//>`}
+      ${rig?.positions.length > 0 && html`<${Action} disabled=${!ready} busy=${beginning} onClick=${script}>Capture all ${rig.positions.length} positions<//>`}
       ${pose && html`<${Action} kind="danger" disabled=${!able} busy=${stopping} onClick=${stop}>Stop${session.script.length ? `, with the ${session.script.length} to come` : ""}<//>`}
       <${Action} kind=${enough ? "primary" : ""} disabled=${!ready || session.poses === 0} busy=${posting} onClick=${solve}>Solve<//>
       ${"speechSynthesis" in window && html`<label class="tick"><input type="checkbox" checked=${voice} onChange=${(event) => setVoice(event.target.checked)} /> Speak</label>`}
     </div>
     ${[refused, unscripted, unsolved, unstopped].map((problem) => html`<${Refusal} problem=${problem} />`)}
   </section>
-  <div>
-    <section aria-label="Live picture"><${Live} rig=${rig} may=${may} aim=${pose ? null : session.next_move} /></section>
-    <${Coverage} session=${session} />
-  </div></div>`;
+  <${Coverage} session=${session} /></div></div>`;
 }
 
 /** A pose's judgement, as it is read from two metres away. */
@@ -126,14 +122,29 @@ function Judged({pose}) {
 }
 
 function Coverage({session}) {
-  const {coverage, links} = session;
-  if (!coverage) return html`<p class="none">Here you will see what the poses cover.</p>`;
-  const state = `${session.poses}-${session.shot.at(-1)?.number}`;
+  const {coverage} = session;
+  if (!coverage) return null;
   return html`<section aria-label="Coverage">
     <p>${session.poses === 1 ? "1 pose" : `${session.poses} poses`} accepted. ${coverage.missing.length ? "Still wanted:" : "All is covered."}</p>
     <ul>${coverage.missing.map((each) => html`<li>${each}</li>`)}</ul>
-    <div class="cards">${Object.entries(links.coverage).map(([name, path]) => html`<figure class="seen"><img src=${`${path}&after=${state}`} alt=${`${name}: ${percent(Math.round(100 * (coverage.devices[name]?.share ?? 0)) / 100)} of the image covered`} /><figcaption>${name}</figcaption></figure>`)}</div>
+    <div class="cards">${Object.entries(coverage.devices).map(([name, device]) => html`<${Covered} name=${name} device=${device} />`)}</div>
+    <p class="legend">Poses that were seen in each part of the image:
+      ${SHADES.map((words, shade) => html`<span><svg class="covered swatch" viewBox="0 0 1 1" aria-hidden="true"><rect class=${`n${shade}`} width="1" height="1" /></svg> ${words}</span>`)}
+      <span><svg class="covered swatch" viewBox="0 0 1 1" aria-hidden="true"><rect class="never" width="1" height="1" /></svg> cannot be reached</span></p>
   </section>`;
+}
+
+const SHADES = ["none", "1", "2", "3 or more"];
+
+/** What one device has seen of the board: how many poses in each of the cells of its image. */
+function Covered({name, device}) {
+  const rows = device.cells.length;
+  const columns = device.cells[0].length;
+  const words = `${name}: ${percent(Math.round(100 * device.share) / 100)} of the image covered`;
+  return html`<figure class="seen"><svg class="covered" viewBox=${`0 0 ${columns} ${(0.75 * rows).toFixed(2)}`} role="img" aria-label=${words}>
+    ${device.cells.flatMap((cells, row) => cells.map((poses, column) => html`<rect class=${device.reachable[row][column] ? `n${Math.min(poses, SHADES.length - 1)}` : "never"} x=${column} y=${0.75 * row} width="1" height="0.75" />
+      ${poses > 0 && html`<text class=${`n${Math.min(poses, SHADES.length - 1)}`} x=${column + 0.5} y=${0.75 * row + 0.51}>${poses}</text>`}`))}
+  </svg><figcaption>${words}</figcaption></figure>`;
 }
 
 /** Shots one after the other: `left` seconds are counted while `idle`, then `shoot` is called; a refusal ends it. */

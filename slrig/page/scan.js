@@ -1,18 +1,21 @@
 // Scan: what the cameras see, one large button, how far the scan is, and the scans so far.
 import {html, useEffect, useState} from "./vendor/preact-htm.js";
+import {Exposure} from "./exposure.js";
 import {Limits, useLimits} from "./limits.js";
 import {Live} from "./live.js";
 import {NameField, called, useName} from "./names.js";
+import {whyNot} from "./ready.js";
 import {ask, follow, once, useAction, useValue} from "./service.js";
-import {Action, JobBadge, Progress, Refusal, count, length} from "./ui.js";
+import {Action, JobBadge, Progress, Refusal, begun, count, length} from "./ui.js";
 
 const SHOWN = 12;
-const SEQUENCES = {fast: "fast: fewest frames", standard: "standard", robust: "robust: for what reflects or is hollow", phase: "phase: few frames, in shades of grey"};
+const SEQUENCES = {fast: "Fast: fewest frames", standard: "Standard", robust: "Robust: for what reflects or is hollow", phase: "Phase: few frames, in shades of grey"};
 const over = (scan) => !["queued", "capturing", "computing"].includes(scan.state);
 
 export function ScanScreen({rig, may}) {
   const [list, problem, again] = useValue(`/scan?limit=${SHOWN}`, 5);
-  const [bracket, setBracket] = useState(null);
+  const [exposures_s, setExposures] = useState(null);
+  const [figures, setFigures] = useState(null);
   const [known] = useValue("/preset");
   const [preset, setPreset] = useState("");
   const [sequence, setSequence] = useState("");
@@ -21,28 +24,32 @@ export function ScanScreen({rig, may}) {
   const scans = list?.scans ?? [];
   // The oldest that is not over holds the rig, whoever asked for it, and also after this page was loaded anew.
   const active = scans.filter((scan) => !over(scan)).at(-1);
+  const patterned = {...(preset ? {preset} : {}), ...(sequence ? {patterns: {sequence}} : {})};
   const [start, busy, refused] = useAction(async () => {
-    const body = {if_busy: "queue", ...(preset ? {preset} : {}), ...(sequence ? {patterns: {sequence}} : {}), ...(bracket ? {exposures_s: bracket} : {}), ...(region ? {reconstruction: {region}} : {}), label: name.trim() || null};
+    const exposing = exposures_s?.length > 1 ? {exposures_s} : exposures_s ? {exposure_s: exposures_s[0]} : {};
+    const body = {if_busy: "queue", ...patterned, ...exposing, ...(region ? {reconstruction: {region}} : {}), label: name.trim() || null};
     const scan = await ask("POST", "/scan", {body, headers: once()});
     sessionStorage.setItem("asked", scan.id);
     used();
     await again();
   });
-  const blocked = !rig ? "The service has not told of the rig yet." : rig.error ?? (rig.calibrated === false ? "The rig has no calibration: a scan would have no millimetres." : null);
+  const blocked = whyNot(rig, may);
+  const presets = known?.presets.filter(({fault}) => !fault) ?? [];
   return html`<div class="two">
     <section aria-label="Live picture">
-      <${Live} rig=${rig} may=${may} bracket=${bracket} setBracket=${setBracket} />
+      <${Live} rig=${rig} may=${may} exposure_s=${exposures_s?.[0]} told=${setFigures} />
     </section>
     <section aria-label="Scan">
-      ${may("scan") && html`<${NameField} name=${name} change=${setName} entered=${start} />`}
-      <${Action} kind="primary large" busy=${busy} disabled=${!may("scan")} onClick=${start}>Scan<//>
-      ${may("scan") && known && html`<label>For an object that is <select value=${preset} onChange=${(event) => setPreset(event.target.value)}>
-        <option value="">as the rig is set</option>${known.presets.filter(({fault}) => !fault).map(({name}) => html`<option value=${name}>${name}</option>`)}</select></label>`}
-      ${may("scan") && html`<label>Patterns <select value=${sequence} onChange=${(event) => setSequence(event.target.value)}>
-        <option value="">as the rig is set</option>${Object.entries(SEQUENCES).map(([name, words]) => html`<option value=${name}>${words}</option>`)}</select></label>`}
+      ${may("scan") && html`<${NameField} name=${name} change=${setName} entered=${() => blocked || start()} />`}
+      <${Action} kind="primary large" busy=${busy} disabled=${Boolean(blocked)} aria-describedby=${blocked && "why-not"} onClick=${start}>Scan<//>
+      ${blocked && html`<p id="why-not" class=${may("scan") ? "warning" : "quiet"}>${blocked.words} ${blocked.help && html`<a href=${blocked.help[0]}>${blocked.help[1]}</a>`}</p>`}
+      ${rig?.error && html`<p class="warning">${rig.error} The next scan tries to open the rig again.</p>`}
+      ${may("scan") && html`<div class="row numbers">${known && html`<label>Preset <select value=${preset} onChange=${(event) => setPreset(event.target.value)}>
+        <option value="">Rig default</option>${presets.map(({name, description}) => html`<option value=${name}>${begun(name)}${description ? `: ${description}` : ""}</option>`)}</select></label>`}
+      <label>Patterns <select value=${sequence} onChange=${(event) => setSequence(event.target.value)}>
+        <option value="">${preset ? "Preset's, or rig default" : "Rig default"}</option>${Object.entries(SEQUENCES).map(([name, words]) => html`<option value=${name}>${words}</option>`)}</select></label></div>`}
+      ${may("scan") && rig?.cameras.length > 0 && html`<${Exposure} rig=${rig} figures=${figures} exposures_s=${exposures_s} setExposures=${setExposures} request=${patterned} robust=${sequence ? null : () => setSequence("robust")} />`}
       ${may("scan") && html`<${Limits} typed=${typed} region=${region} change=${change} others=${preset ? null : rig?.scan_defaults?.region} preset=${preset} />`}
-      ${!may("scan") && html`<p class="quiet">Your key is for looking only.</p>`}
-      ${blocked && html`<p class="warning">${blocked} ${rig?.calibrated === false && html`<a href="#/calibrate">Calibrate</a>`}</p>`}
       <${Refusal} problem=${refused} />
       ${active && html`<${UnderWay} key=${active.id} scan=${active} changed=${again} may=${may} />`}
       ${!active && scans[0]?.error && html`<${Refusal} problem=${{document: {title: "The last scan failed"}, message: scans[0].error.detail}} />`}

@@ -28,12 +28,16 @@ def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit:
     # A rig alone has no fleet.
     count(page.get_by_role("link", name="Fleet"), 0)
 
-    page.get_by_role("group", name="Camera").get_by_role("button", name="left").click()
+    # The picture is there at once, and what it says of the light.
     page.get_by_role("img", name="Live picture of camera left").wait_for()
     # The picture itself has this figure, so it is there.
     page.get_by_text("% saturated").wait_for()
+    page.get_by_role("img", name="Brightness of the picture").wait_for()
+    page.get_by_role("button", name="Look and propose").click()
+    page.get_by_text("of what is lit can be read").wait_for()
     assert violations(page) == []
     looks_as_kept(page, "scan")
+    page.get_by_role("button", name="As the rig is set").click()
     page.get_by_role("button", name="Off").click()
 
     page.get_by_label("Name").fill("plate-007")

@@ -341,7 +341,7 @@ def test_the_camera_is_known_with_its_deviations() -> None:
 
 def test_the_error_is_said_to_be_across_the_line_of_sight() -> None:
     verdict = of_one().verdict
-    assert "a point of known distance is expected within" in verdict.summary
+    assert "the expected error of a point of known distance is" in verdict.summary
     assert "mm across the line of sight (1 in" in verdict.summary
     assert verdict.summary.endswith("that takes a projector or a second camera, calibrated with it")
     (error,) = (each for each in verdict.figures if each.figure == "error")

@@ -90,8 +90,8 @@ def test_a_sound_calibration_is_good_and_says_what_was_judged() -> None:
     found = judged(_solution())
     assert found.grade is Grade.GOOD
     assert found.reasons == found.remarks == ()
-    assert found.summary.startswith("good: a scanned point is expected within 0.01 mm (1 in 32,4")
-    assert found.summary.endswith("twice that is within the wanted 0.16 mm")
+    assert found.summary.startswith("good: the expected error of a scanned point is 0.01 mm (1 in 32,4")
+    assert found.summary.endswith("within the limit of 0.081 mm")
     assert {each.figure for each in found.figures} >= {
         "error", "poses", "camera_rms_px", "projector_rms_px", "held_out", "stated_ratio", "principal_sigma_px",
         "focal_sigma_share",
@@ -192,7 +192,7 @@ def test_the_grade_follows_the_millimetres_that_are_wanted() -> None:
 def test_a_board_that_limits_the_error_is_named_with_what_to_do() -> None:
     found = judged(_solution(), replace(EXPECTED, board_mm=0.009))
     assert _remarks(found, "limited by the board, whose size contributes 0.009 mm", "measure both rulers")
-    assert "by the size of the board most of all" in found.summary
+    assert "mostly from the board's size" in found.summary
     poor = judged(_solution(), replace(EXPECTED, board_mm=0.009), tolerance_mm=0.015)
     assert poor.grade is Grade.USABLE
     assert _says(poor, "limited by the board", "--square-sigma")
