@@ -324,7 +324,7 @@ class AxisJob(Job):
                 angles_deg.append(angle_deg)
             except PoseRefusedError as error:
                 refused[f"{angle_deg:g}°"] = str(error)
-        found = axis_of_poses(read, self.board, calibration, angles_deg)
+        found = axis_of_poses(read, self.board, calibration, angles_deg, refused=refused)
         axis = found.axis.measured_axis
         return Outcome(
             {

@@ -4,7 +4,7 @@ and figures that tell how well each camera saw it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from slrig.calibrate.store import ReadPose
 from slrig.calibration import COLUMN, PROJECTOR, ROW, Board, BoardView, Correspondences, PoseObservation, ViewQuality
 from slrig.calibration.detection import board_mask, find_board, interior_mask, measure_blur_px, paper_mask, refine_view
 from slrig.calibration.health.drift import estimate_board_poses
-from slrig.errors import PatternError, PoseRefusedError
+from slrig.errors import PatternError, PoseRefusedError, TurntableRefusedError
 from slrig.model import (
     Axis,
     Black,
@@ -33,7 +33,7 @@ from slrig.model import (
     Size,
     White,
 )
-from slrig.multiview import BoardAxis, axis_from_board
+from slrig.multiview import MIN_POSES, BoardAxis, axis_from_board
 from slrig.patterns import MIN_BORDER_DISTANCE_PX, cell_positions, edge_positions, index_of_word, line_positions
 from slrig.reconstruction import (
     AxisFrames,
@@ -509,8 +509,11 @@ def axis_of_poses(
     board: Board,
     calibration: Calibration,
     angles_deg: Sequence[float] | None = None,
+    *,
+    refused: Mapping[str, str] | None = None,
 ) -> BoardAxis:
     """The axis that a board was turned about. angles_deg : where the turntable says that it stood, pose by pose.
+    refused : the poses that could not be read, and why, for the words of a refusal.
 
     Raises
     ------
@@ -519,5 +522,12 @@ def axis_of_poses(
     TurntableRefusedError
         As `axis_from_board` does.
     """
+    if len(poses) < MIN_POSES and refused:
+        name, why = next(iter(refused.items()))
+        message = (
+            f"the board was read in {len(poses)} of {len(poses) + len(refused)} poses, and an axis takes {MIN_POSES}. "
+            f"{name}: {why}"
+        )
+        raise TurntableRefusedError(message)
     known = estimate_board_poses(poses, board, calibration)
     return axis_from_board(known.names, known.poses, known.covariance, board.points_mm, angles_deg)

@@ -466,7 +466,7 @@ def axis(
                 angles.append((angle or 0.0) * number)
             except (PoseRefusedError, PatternError) as error:
                 refused[name] = str(error)
-        found = axis_of_poses(read, board, rig, None if angle is None else angles)
+        found = axis_of_poses(read, board, rig, None if angle is None else angles, refused=refused)
         record = with_axis(before, found.axis.measured_axis, source=AxisSource.BOARD, of=folder.absolute().name)
         write_file(output, encode_turntable(record))
         display("done", 1.0, "")

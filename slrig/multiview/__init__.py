@@ -4,6 +4,7 @@ from slrig.multiview.fusion import FusedModel, PoseErrors, concatenate_views, fu
 from slrig.multiview.markers import MarkerFit, MarkerObservation, MarkerObservations, marker_poses
 from slrig.multiview.registration import Registration, register_views
 from slrig.multiview.turntable import (
+    MIN_POSES,
     BoardAxis,
     TurntableAxis,
     axis_from_board,
@@ -15,6 +16,7 @@ from slrig.multiview.turntable import (
 from slrig.multiview.unknown_poses import find_start_poses
 
 __all__ = [
+    "MIN_POSES",
     "BoardAxis",
     "FusedModel",
     "MarkerFit",

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 from slrig.bundle import write_bundle
-from slrig.calibrate.pose_reading import bundle_device_sizes, moved_px, read_captured, read_pose
+from slrig.calibrate.pose_reading import axis_of_poses, bundle_device_sizes, moved_px, read_captured, read_pose
 from slrig.calibrate.store import ReadPose
 from slrig.calibration.board import COLUMN, ROW, Board, BoardKind, Correspondences
 from slrig.calibration.detection.detection import board_mask, find_board
 from slrig.calibration.poses.checks import LIMITS
 from slrig.calibration.solution import PROJECTOR
-from slrig.errors import PatternError, PoseRefusedError
+from slrig.errors import PatternError, PoseRefusedError, TurntableRefusedError
 from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Size, White
+from tests.unit.calibrate.calibration_bench import tame_calibration
 from tests.unit.calibrate.shot_boards import BOARD, Standing, both, patterns_for, position_at, shot, truth_of
 
 ENDS = patterns_for(Size(384, 240))[:2]
@@ -227,3 +228,11 @@ def test_clipped_paper_is_counted(pose: Capture) -> None:
     ends = without(pose, Gray, LineShift)
     bright = [replace(each, image=np.minimum(each.image.astype(int) * 2, 255).astype(np.uint8)) for each in ends.shots]
     assert read_captured(replace(ends, shots=tuple(bright)), BOARD, "bright").figures["left"].saturated > 0.3
+
+
+def test_an_axis_of_a_board_that_was_not_seen_is_refused_with_the_reason() -> None:
+    refused = {"-50°": "the board is not in view", "-30°": "the board is half in view"}
+    with pytest.raises(
+        TurntableRefusedError, match=r"in 0 of 2 poses, and an axis takes 3\. -50°: the board is"
+    ):
+        axis_of_poses([], BOARD, tame_calibration(), [], refused=refused)
