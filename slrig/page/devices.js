@@ -1,24 +1,29 @@
-// Devices: the rig as it is and as it is set, what else is plugged in, what examinations found, and who is logged in.
-import {html, useEffect, useState} from "./vendor/preact-htm.js";
-import {ask, follow, once, useAction, useValue} from "./service.js";
-import {Action, Badge, Facts, Progress, Refusal, moment, percent} from "./ui.js";
+// Devices: the rig as it is and as it is set, its tests, what else is plugged in, and who is logged in.
+import {html} from "./vendor/preact-htm.js";
+import {Tests} from "./examine.js";
+import {FileText, Reopen, Settings} from "./rigfile.js";
+import {useAction, useValue} from "./service.js";
+import {Action, Badge, Facts, Refusal, moment} from "./ui.js";
 
 const short = (value) => Number(value.toPrecision(3));
 const duration = (seconds) => (seconds < 1e-3 ? `${short(1e6 * seconds)}\u00a0µs` : seconds < 1 ? `${short(1e3 * seconds)}\u00a0ms` : `${short(seconds)}\u00a0s`);
 const between = ([least, most], words) => (least === most ? `${words(least)} only` : `${words(least)} to ${words(most)}`);
 
-export function DevicesScreen({rig, may}) {
-  return html`<section aria-label="This rig"><${ThisRig} rig=${rig} /></section>
+export function DevicesScreen({rig, again, may}) {
+  const [file, , readFile] = useValue(may("administer") ? "/rig/file" : null, 10);
+  const given = {file, rig, may, changed: () => Promise.all([readFile(), again()])};
+  return html`<section aria-label="This rig"><${ThisRig} ...${given} /></section>
+    <section aria-label="Tests of the rig"><${Tests} ...${given} /></section>
     <section aria-label="Plugged in"><${PluggedIn} rig=${rig} /></section>
-    <section aria-label="Examinations"><${Examinations} rig=${rig} may=${may} /></section>
     <section aria-label="You"><${You} may=${may} /></section>`;
 }
 
-function ThisRig({rig}) {
-  if (!rig) return null;
+function ThisRig(given) {
+  const {file, rig} = given;
+  if (!rig) return html`<p class="wait">Asking the service …</p>`;
   const {cameras, projector} = rig;
   return html`<h2>This rig</h2>
-    ${rig.error && html`<${Refusal} problem=${{document: {title: "The rig is not open"}, message: rig.error}}><p>The next scan tries again.</p><//>`}
+    ${rig.error && html`<${Refusal} problem=${{document: {title: "The rig is not open"}, message: rig.error}}><p>Put that right, then open the rig again; the next scan tries, too.</p><//>`}
     ${!rig.open && !rig.error && html`<p role="status">The rig is being opened …</p>`}
     <ul class="cards">${cameras.map((camera) => html`<li class="box" key=${camera.name}><${Camera} camera=${camera} /></li>`)}
       ${projector && html`<li class="box"><h3>Projector${projector.name === "projector" ? "" : ` ${projector.name}`}</h3><${Facts} of=${[
@@ -27,7 +32,9 @@ function ThisRig({rig}) {
         ["Pixels", projector.size_px.join(" × ")],
         ["Sequences", projector.plays ? "plays them by itself" : "shows one pattern at a time"],
         ["From command to light", duration(projector.latency_s)],
-      ]} /></li>`}</ul>`;
+      ]} /></li>`}</ul>
+    <${Reopen} ...${given} />
+    ${file && html`<${Settings} ...${given} /><${FileText} ...${given} />`}`;
 }
 
 function Camera({camera}) {
@@ -70,79 +77,6 @@ function PluggedIn({rig}) {
     ${found && html`<details><summary>Installed drivers</summary>
       <p>${found.drivers.filter(({kind}) => kind !== "finder").map(({kind, name}) => `${name} (${kind})`).join(", ")}</p>
       ${found.elsewhere.map(({message}) => html`<p class="quiet">${message}</p>`)}</details>`}`;
-}
-
-function Examinations({rig, may}) {
-  const [last, problem, again] = useValue("/rig/examinations", 10);
-  if (!last) return html`<${Refusal} problem=${problem?.status ? problem : null} />`;
-  const given = {rig, may, ended: again};
-  return html`<div class="halves">
-    <div class="box"><h2>Doctor</h2>
-      ${last.doctor ? html`<${Doctor} ...${last.doctor} />` : html`<p>Not examined yet.</p>`}
-      <${Examine} kind="doctor" ...${given}>It looks for faults of light, timing, focus and flicker. Put a light, still object before the rig.<//></div>
-    <div class="box"><h2>Conformance</h2>
-      ${last.conformance ? html`<${Conformance} ...${last.conformance} />` : html`<p>Not examined yet.</p>`}
-      <${Examine} kind="conformance" ...${given}>It checks that the drivers keep what they promise: the rig is closed and opened many times.<//></div>
-  </div>`;
-}
-
-/** Starts an examination, and shows it while it runs, also one that somebody else started. */
-function Examine({kind, rig, may, ended, children}) {
-  const [job, setJob] = useState(null);
-  const other = new RegExp(`^${kind} (.+)$`).exec(rig?.holder ?? "")?.[1];
-  useEffect(() => {
-    if (other) setJob(other);
-  }, [other]);
-  const [start, busy, refused] = useAction(async () => setJob((await ask("POST", `/rig/${kind}`, {body: {if_busy: "queue"}, headers: once()})).id));
-  return html`<p class="quiet">${children}</p>
-    ${job ? html`<${Examining} key=${job} here=${`/rig/job/${job}`} may=${may} ended=${() => (setJob(null), ended())} />`
-      : html`<${Action} busy=${busy} disabled=${!may("calibrate")} onClick=${start}>Examine now<//>`}
-    <${Refusal} problem=${refused} />`;
-}
-
-function Examining({here, may, ended}) {
-  const [at, setAt] = useState({stage: "waits for the rig", fraction: 0});
-  const [failed, setFailed] = useState(null);
-  useEffect(() => {
-    const look = async () => {
-      const body = await ask("GET", here);
-      if (body.error) setFailed(body.error);
-      else if (body.state === "succeeded") ended();
-    };
-    return follow(`${here}/events`, (kind, data) => {
-      if (kind === "progress") setAt(data);
-      if (kind === "state") look();
-    }, look);
-  }, [here]);
-  const [cancel, busy, refused] = useAction(() => ask("POST", `${here}/cancel`));
-  if (failed) return html`<${Refusal} problem=${{document: {title: "The examination ended early"}, message: failed.detail}}>
-    <${Action} onClick=${ended}>Close<//><//>`;
-  return html`<${Progress} label=${at.stage} fraction=${at.fraction} detail=${at.detail} />
-    <${Action} busy=${busy} disabled=${!may("calibrate")} onClick=${cancel}>Cancel<//>
-    <${Refusal} problem=${refused} />`;
-}
-
-const SEVERITIES = {fault: "bad", note: "warn", ok: "good"};
-
-function Doctor({at, found}) {
-  const rows = (findings) => html`<ul class="findings">${findings.map((each) => html`<li>
-    <${Badge} kind=${SEVERITIES[each.severity]}>${each.severity}<//> <strong>${each.subject}</strong>: ${each.found}
-    ${each.remedy && html`<p><strong>What to do:</strong> ${each.remedy}.</p>`}</li>`)}</ul>`;
-  const matter = found.findings.filter((each) => each.severity !== "ok");
-  const well = found.findings.filter((each) => each.severity === "ok");
-  return html`<p class="quiet">${moment(at)}</p>
-    ${matter.length === 0 ? html`<p><${Badge} kind="good">healthy<//> It found nothing wrong.</p>` : rows(matter)}
-    <details><summary>What is well: ${well.length}</summary>${rows(well)}</details>`;
-}
-
-function Conformance({at, found}) {
-  const wrong = found.checks.filter((check) => ["failed", "not run"].includes(check.outcome));
-  return html`<p class=${`verdict ${wrong.length ? "bad" : "good"}`}>${Math.floor(100 * found.score)} %</p>
-    <p>${found.passed} of ${found.applicable} checks that apply passed. <span class="quiet">${moment(at)}</span></p>
-    ${found.stopped && html`<p class="warning">It ended early: ${found.stopped}</p>`}
-    <ul class="findings">${wrong.map((check) => html`<li><${Badge} kind="bad">${check.outcome}<//> <strong>${check.title}</strong>
-      ${check.failure && html`<${Facts} of=${[["Where", check.failure.where || null], ["Asked", check.failure.asked], ["Found", check.failure.found], ["What to do", check.failure.do]]} />`}
-      ${check.reason && html`<p>${check.reason}</p>`}</li>`)}</ul>`;
 }
 
 function You({may}) {

@@ -33,9 +33,9 @@ function useLooking() {
 /**
  * What a camera sees while nobody scans. `aim`: where a board goes next, as a calibration says it. `plain`: nothing is
  * marked. `exposure_s`: of the picture; null is the rig file's. `told(figures)` is called each second with what the picture says, see `measured`, and
- * with null when it is over.
+ * with null when it is over. `ghost`: by camera, a picture that lies over the live one, half-transparent.
  */
-export function Live({rig, may, aim, plain = false, exposure_s = null, told}) {
+export function Live({rig, may, aim, ghost, plain = false, exposure_s = null, told}) {
   const [chosen, setChosen] = useState(() => sessionStorage.getItem(KEPT));
   const [light, setLight] = useState("white");
   const [failed, setFailed] = useState(false);
@@ -63,6 +63,7 @@ export function Live({rig, may, aim, plain = false, exposure_s = null, told}) {
   return html`
     ${absent ? html`<div class="live none" role=${failed ? "alert" : null}>${absent}</div>`
       : html`<div class="aimed"><${Picture} key=${stream} stream=${stream} camera=${camera} running=${running} told=${told} failed=${() => setFailed(true)} />
+        ${ghost?.[camera] && html`<img class="ghost" src=${ghost[camera]} alt="The last view, half-transparent" />`}
         ${aimed && html`<${Aim} aim=${aimed} size_px=${size_px} />`}</div>`}
     <div class="row">
       ${names.length > 0 && html`<${Choice} label="Camera" value=${camera ?? OFF} options=${[...names.map((name) => [name, name]), [OFF, "Off"]]} chosen=${choose} />`}

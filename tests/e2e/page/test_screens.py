@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,7 @@ from sqlalchemy import update
 from slrig.api.auth import KeyRing
 from slrig.api.scopes import KeyScope
 from slrig.catalogue.store import Catalogue, RigRow, open_catalogue
-from slrig.config import ServiceSettings
+from slrig.config import ServiceSettings, read_rig
 from slrig.conformance import CheckOutcome, ConformanceReport
 from slrig.conformance.bench import Failure
 from slrig.conformance.running import CheckResult
@@ -59,7 +60,8 @@ def test_devices_are_shown_as_set_and_as_examined(start: Start, tmp_path: Path, 
     page = visit(service, "devices")
     camera = page.get_by_role("listitem").filter(has=page.get_by_role("heading", name="Camera left"))
     camera.get_by_text("not set yet").first.wait_for()
-    page.get_by_text("Not examined yet.").first.wait_for()
+    doctor = page.get_by_role("region", name="Doctor")
+    doctor.get_by_text("Not examined yet.").wait_for()
     page.get_by_role("region", name="Plugged in").get_by_text("Installed drivers").wait_for()
     assert violations(page) == []
     with service.client() as client:
@@ -73,16 +75,38 @@ def test_devices_are_shown_as_set_and_as_examined(start: Start, tmp_path: Path, 
         ok("focus.sharp", "camera 'left'", "it is sharp"),
     )
     keep(service.data, "doctor", Diagnosis("small", findings, {}, None, None, None, None, ()).document())
-    page.get_by_text("it is too dark").wait_for()
-    page.get_by_text("open the iris").wait_for()
+    page.get_by_text("It is too dark.").wait_for()
+    page.get_by_text("Open the iris.").wait_for()
     page.get_by_text("What is well: 1").click()
-    page.get_by_text("it is sharp").wait_for()
+    page.get_by_text("It is sharp.").wait_for()
     assert violations(page) == []
     looks_as_elsewhere(page, "devices")
     # Examined from the page, which shows what was found in place of the last.
-    page.get_by_role("button", name="Examine now").first.click()
-    page.get_by_role("button", name="Cancel").wait_for()
-    page.get_by_text("it is too dark").wait_for(state="detached", timeout=120_000)
+    doctor.get_by_role("button", name="Examine now").click()
+    doctor.get_by_role("button", name="Cancel").wait_for()
+    doctor.get_by_role("button", name="Apply to the rig file").click(timeout=120_000)
+    doctor.get_by_text("Applied. The rig was opened again").wait_for()
+    count(page.get_by_text("It is too dark"), 0)
+    measured, known = rig.read_text(), read_rig(rig).head
+    assert known is not None
+    assert known.exposure_s is not None
+    assert violations(page) == []
+    # Settings of the file are changed beside their comments, and what cannot be is told at its field.
+    here = page.get_by_role("region", name="This rig")
+    here.get_by_text("Change settings").click()
+    here.get_by_label("Exposure, ms").fill("16000")
+    here.get_by_role("alert").get_by_text("Expected 0.01 to 10000").wait_for()
+    disabled(here.get_by_role("button", name="Save and open the rig again").first)
+    here.get_by_label("Exposure, ms").fill("16,5")
+    here.get_by_role("button", name="Save and open the rig again").first.click()
+    disabled(here.get_by_role("button", name="Save and open the rig again").first)
+    doctor.get_by_role("button", name="Apply to the rig file").wait_for()
+    assert tomllib.loads(rig.read_text())["head"]["exposure_s"] == 0.0165
+    assert rig.with_name("rig.toml.bak").read_text() == measured
+    # An editor takes it back, and the rig is opened by that.
+    rig.write_text(measured)
+    here.get_by_role("button", name="Open the rig again").click()
+    doctor.get_by_text("The rig file holds what was measured.").wait_for()
     keep(service.data, "doctor", Diagnosis("small", findings, {}, None, None, None, None, ()).document())
 
     # On a phone, by a key for looking.
@@ -100,6 +124,8 @@ def test_devices_are_shown_as_set_and_as_examined(start: Start, tmp_path: Path, 
     page.get_by_text("Every frame shows its pattern").wait_for()
     page.get_by_text("Logged in as Ann").wait_for()
     page.get_by_text("You may look.").wait_for()
+    page.get_by_text("A key with the scope “administer” sees what is proposed").first.wait_for()
+    disabled(page.get_by_role("button", name="Open the rig again"))
     count(page.get_by_role("table", name="Who did what last"), 0)
     fits(page)
     looks_as_elsewhere(page, "devices-phone-dark")
@@ -211,7 +237,9 @@ def test_scans_are_joined_and_an_object_is_turned_by_hand(start: Start, tmp_path
     # Listed from new to old; the first that is chosen gives the frame.
     for number in reversed(range(len(ANGLES))):
         boxes.nth(number).check()
-    page.get_by_role("button", name="Make one model of 3").click()
+    join = page.get_by_role("region", name="Join scans")
+    join.get_by_role("button", name="By the turntable's axis").click()
+    join.get_by_role("button", name="Make one model of 3").click()
     page.get_by_role("alert").get_by_text("axis: expected that of the turntable").wait_for()
     assert violations(page) == []
 
@@ -226,6 +254,10 @@ def test_scans_are_joined_and_an_object_is_turned_by_hand(start: Start, tmp_path
     page.get_by_role("link", name="model.ply").wait_for()
     page.keyboard.press("Escape")
     page.get_by_role("columnheader", name="Over σ").wait_for()
+    views = page.get_by_role("link").filter(has_text="View ")
+    count(views, 3)
+    views.filter(has_text="View 2, 40°").get_by_text("turned 40").wait_for()
+    count(page.get_by_text("pose known to"), 2)
     page.get_by_role("button", name="σ", exact=True).click()
     assert page.get_by_role("button", name="Stripe").count() == 0
     assert violations(page) == []
@@ -237,8 +269,15 @@ def test_scans_are_joined_and_an_object_is_turned_by_hand(start: Start, tmp_path
     page.get_by_role("button", name="Shoot the views").click()
     page.get_by_text("turn the object by 120° for view 2 of 3").wait_for()
     fits(page)
-    page.get_by_role("button", name="I have turned it: next view").click()
+    turning = page.get_by_role("group", name="Turn the object")
+    turning.get_by_text("To 120° in all").wait_for()
+    turning.get_by_role("button", name="left").click()
+    ghost = turning.get_by_role("img", name="The last view, half-transparent")
+    assert ghost.evaluate("(image) => image.decode().then(() => image.naturalWidth)") > 0
+    turning.get_by_role("button", name="Off").click()
+    turning.get_by_role("button", name="I have turned it: next view").click()
     page.get_by_text("turn the object by 120° for view 3 of 3").wait_for()
+    turning.get_by_role("button", name="Make the model of 2 views").wait_for()
     page.get_by_role("button", name="Stop it").click()
     page.get_by_role("alert").get_by_text("cancelled while its views were shot").wait_for()
     page.get_by_role("button", name="Delete").click()
