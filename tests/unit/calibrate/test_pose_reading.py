@@ -232,7 +232,5 @@ def test_clipped_paper_is_counted(pose: Capture) -> None:
 
 def test_an_axis_of_a_board_that_was_not_seen_is_refused_with_the_reason() -> None:
     refused = {"-50°": "the board is not in view", "-30°": "the board is half in view"}
-    with pytest.raises(
-        TurntableRefusedError, match=r"in 0 of 2 poses, and an axis takes 3\. -50°: the board is"
-    ):
+    with pytest.raises(TurntableRefusedError, match=r"in 0 of 2 poses, and an axis takes 3\. -50°: the board is"):
         axis_of_poses([], BOARD, tame_calibration(), [], refused=refused)
