@@ -33,7 +33,6 @@ from slrig.bundle import (
 )
 from slrig.capture import (
     NOISE_FLOOR_DN,
-    SETTINGS_TOLERANCE,
     Evidence,
     EvidenceSummary,
     ExposureFault,
@@ -45,6 +44,7 @@ from slrig.capture import (
     capture,
     choose_triggers,
     detect_movement,
+    differs_from_request,
     judge_exposure,
     round_to_refresh_s,
 )
@@ -530,7 +530,7 @@ def exposed(rig: Rig, plan: ScanPlan) -> tuple[Rig, tuple[float, ...], list[str]
     told = [] if plan.preset is None else [f"the scan was asked for by {plan.preset}"]
 
     def instead(exposure_s: float, asked_s: float, whose: str, why: str) -> float:
-        if abs(exposure_s - asked_s) > SETTINGS_TOLERANCE * asked_s:
+        if differs_from_request(exposure_s, asked_s):
             told.append(f"{whose} exposes for {exposure_s:.6g} s instead of {asked_s:.6g} s: {why}")
         return exposure_s
 
@@ -538,12 +538,20 @@ def exposed(rig: Rig, plan: ScanPlan) -> tuple[Rig, tuple[float, ...], list[str]
         least_s, most_s = zip(*(camera.info.exposure_range_s for camera in cameras), strict=True)
         return instead(min(max(asked_s, *least_s), *most_s), asked_s, whose, "what it can do")
 
-    def snapped(asked_s: float, whose: str, cameras: Iterable[Camera]) -> float:
+    def snapped(asked_s: float, whose: str, names: Collection[str]) -> float:
         if refresh_s is None:
             return asked_s
         why = f"whole periods of the projector ({refresh_s:.6g} s)"
-        ranges_s = [camera.info.exposure_range_s for camera in cameras]
-        return instead(round_to_refresh_s(asked_s, refresh_s, ranges_s), asked_s, whose, why)
+        whole_s = round_to_refresh_s(asked_s, refresh_s, [rig.cameras[name].info.exposure_range_s for name in names])
+        if differs_from_request(whole_s, asked_s):
+            for name in names:
+                taken_s = rig.cameras[name].configure(replace(rig.settings[name], exposure_s=whole_s)).exposure_s
+                if differs_from_request(taken_s, whole_s):
+                    told.append(
+                        f"{whose} exposes for {asked_s:.6g} s, not {why}: camera '{name}' takes {taken_s:.6g} s"
+                    )
+                    return asked_s
+        return instead(whole_s, asked_s, whose, why)
 
     own_s = {name: each.exposure_s for name, each in rig.settings.items()}
     exposures_s, every, factors = plan.rising_exposures_s, "every camera", sorted(plan.exposure_factors or ())
@@ -551,12 +559,11 @@ def exposed(rig: Rig, plan: ScanPlan) -> tuple[Rig, tuple[float, ...], list[str]
         mean_s = geometric_mean(own_s.values())
         exposures_s = tuple(scaled(factor * mean_s, every, rig.cameras.values()) for factor in factors)
     if exposures_s:
-        cameras = rig.cameras.values()
-        return rig, tuple(dict.fromkeys(snapped(each, every, cameras) for each in exposures_s)), told
+        return rig, tuple(dict.fromkeys(snapped(each, every, rig.cameras) for each in exposures_s)), told
     for name in own_s if factors else ():
         own_s[name] = scaled(factors[0] * own_s[name], f"camera '{name}'", [rig.cameras[name]])
     settings = {
-        name: replace(each, exposure_s=snapped(own_s[name], f"camera '{name}'", [rig.cameras[name]]))
+        name: replace(each, exposure_s=snapped(own_s[name], f"camera '{name}'", [name]))
         for name, each in rig.settings.items()
     }
     return replace(rig, settings=settings), (), told

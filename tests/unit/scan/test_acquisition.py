@@ -19,7 +19,7 @@ from slrig.bundle import BundleWriter, read_bundle
 from slrig.bundle.sidecars import RefusedFrame, TurntableAngle, read_notes, read_refused, read_turntable_angle
 from slrig.capture.exposure import check_exposures
 from slrig.capture.verifier import EvidenceSummary, check_capture
-from slrig.devices import CameraSettings, Projector, Synchronisation, Trigger
+from slrig.devices import AppliedSettings, Camera, CameraSettings, Projector, Synchronisation, Trigger
 from slrig.errors import (
     BundleError,
     DeviceGoneError,
@@ -333,6 +333,24 @@ def test_whole_periods_of_the_projector_are_those_that_the_camera_can_do(tmp_pat
         assert len(told) == 2 * len(rig.cameras)
         _, bracket_s, _ = exposed(slow, ScanPlan(exposures_s=(0.6 * longest_s, longest_s)))
         assert bracket_s == (period_s,)
+        # A webcam that takes exposures by powers of two.
+        stepped = {name: cast("Camera", Stepped(camera, 0.0156))}
+        own = replace(rig, cameras=stepped, settings={name: CameraSettings(0.0156)})
+        scaled, _, told = exposed(
+            replace(own, projector=cast("Projector", Refreshing(rig.projector, 1 / 120))), ScanPlan()
+        )
+        assert scaled.settings[name].exposure_s == 0.0156
+        assert f"not whole periods of the projector (0.00833333 s): camera '{name}' takes 0.0156 s" in told[0]
+
+
+class Stepped:
+    """A camera that takes one exposure for every other."""
+
+    def __init__(self, camera: Camera, taken_s: float) -> None:
+        self.info, self._taken_s = camera.info, taken_s
+
+    def configure(self, settings: CameraSettings) -> AppliedSettings:
+        return AppliedSettings(self._taken_s, settings.gain)
 
 
 class Refreshing:
