@@ -311,10 +311,11 @@ class Device:
     def really(self, number: int) -> int:
         """What the camera uses of a control, whatever its driver says."""
         control = self.controls.get(number, {"default": 0})
-        value = control["default"] if number in self.forgotten else self.values.get(number, 0)
+        value: float = control["default"] if number in self.forgotten else self.values.get(number, 0)
         creeps_s = self.now_ns() / 1e9 % (2 * CREEPS_S)
         value += control.get("creeps", 0) * abs(creeps_s / CREEPS_S - 1)
-        return round(min(value, control.get("really_at_most", value)))
+        most: float = control.get("really_at_most", value)
+        return round(min(value, most))
 
     def stop(self, file: object) -> None:
         if self.owner is file:

@@ -627,4 +627,4 @@ def calibrated_and_verified(rig: Path, world: World, **environment: str) -> Path
         scan = ended(caller, "/scan")
         verified = ended(caller, "/rig/verification")
         assert verified["found"]["state"] == "good", verified["found"]
-    return service.data / "scans" / scan["id"]
+    return service.data / "scans" / str(scan["id"])
