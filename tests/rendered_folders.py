@@ -23,7 +23,7 @@ from simulated_rig.scene import build_surface, read_scene
 from slrig.errors import SlrigError
 from slrig.importers import ImageNaming, ProjectorCode, assign_images
 from slrig.importers.captures import ImageAssignment
-from slrig.model import Axis, Black, Gray, LineShift, Pattern, Pixels, Size, White
+from slrig.model import Axis, Black, Gray, LineShift, Pattern, Pixels, Sine, Size, White
 from tests.light_bound import ExposedView
 
 CONFIG = Path(__file__).parents[1] / "config"
@@ -113,6 +113,9 @@ def pattern_light(pattern: Pattern, size: Size) -> Pixels:
             line = gray_light(size.along(axis), bit, bits, cell, offset, inverted=inverted)
         case LineShift(axis, shift, period, width):
             line = (((np.arange(size.along(axis)) - shift) % period < width) * 255).astype(np.uint8)
+        case Sine(axis, sine_period, phase, steps):
+            turns = np.arange(size.along(axis)) / sine_period - phase / steps
+            line = np.rint(127.5 + 127.5 * np.cos(2 * np.pi * turns)).astype(np.uint8)
         case _:
             raise AssertionError(pattern)
     return line[None, :] if axis is Axis.COLUMN else line[:, None]
