@@ -19,6 +19,7 @@ from tests.contract.pairing import FRAMES, wrong_pairings
 from tests.contract.stage import REFERENCE_EXPOSURE_S, Stage
 from tests.contract.v4l2_bench import CAMERA, Faked, VirtualDevice
 from tests.contract.v4l2_sensor import GAIN_UNITS
+from tests.unit.capture.fake_rig import CAMERA as EYE
 from tests.unit.capture.fake_rig import Scene, patterns_for
 from tests.virtual_clock import VirtualClock
 
@@ -32,9 +33,9 @@ DISTURBED = {"lost": 0.1, "damaged": 0.05, "jitter_s": 0.002}
 HOLDS_S = 0.03
 
 
-def stage(exposure_s: float, size: Size = SIZE, *, clock: Clock | None = None, **camera: Size) -> Stage:
+def stage(exposure_s: float, size: Size = SIZE, *, clock: Clock | None = None, camera: Size = EYE) -> Stage:
     """A display whose light is late, now and then by 1 ms more; as bright at any exposure."""
-    scene = Scene(noise_dn=1.0, white=0.6 * REFERENCE_EXPOSURE_S / exposure_s, projector=size, **camera)
+    scene = Scene(noise_dn=1.0, white=0.6 * REFERENCE_EXPOSURE_S / exposure_s, projector=size, camera=camera)
     scene.column_px += (size.width_px - SMALL.width_px) / 2
     return Stage(scene, latency_s=0.03, jitter_s=0.001, clock=clock or VirtualClock(threads=READERS))
 
@@ -101,7 +102,7 @@ def pace_s(rig: Rig) -> tuple[float, int]:
     """The time from one of 20 patterns to the next, and how many exposures were refused."""
     refused: list[RefusedFrame] = []
     shots = list(capture(rig, TWENTY, refused=refused.append))
-    return max(shot.time_s for shot in shots) / (len(TWENTY) - 1), len(refused)
+    return max(shot.time_s or 0.0 for shot in shots) / (len(TWENTY) - 1), len(refused)
 
 
 @pytest.mark.parametrize(
@@ -126,7 +127,7 @@ def test_twenty_patterns_take_a_second_and_a_half_on_a_real_clock() -> None:
     """A display of 60 Hz, and a webcam of 30 frames a second that reads out for 20 ms."""
     exposure_s, readout_s = 1 / 60, 0.02
     where = stage(exposure_s, clock=SystemClock(), camera=CAMERA)
-    faked = Faked(rates=((1, 30),), stamp="first packet", readout_s=readout_s, bands=4, stretches=False)
+    faked = Faked(rates=((1, 30),), stamp="first packet", readout_s=readout_s, rolling=True, stretches=False)
     with VirtualDevice(where, faked) as device:
         cameras = {"eye": device.open_camera(gain_unity=GAIN_UNITS)}
         settings = {"eye": CameraSettings(exposure_s)}
