@@ -185,7 +185,7 @@ def look_at_service(service: Serving) -> ServiceBody:
         checks=checks,
         pending=pending,
         spare_bytes=service.settings.min_free_bytes,
-        damaged=service.store.damaged(),
+        damaged=dict(service.store.damaged()),
     )
 
 

@@ -196,10 +196,10 @@ def test_a_result_is_looked_at_measured_compared_and_downloaded(service: Service
     page.get_by_role("dialog", name="Keys").get_by_text("Full screen, and back").wait_for()
     assert violations(page) == []
     page.keyboard.press("Escape")
-    shown, area_px = picture(page), page.locator(".stage").bounding_box()
+    drawn, area_px = picture(page), page.locator(".stage").bounding_box()
     assert area_px is not None
     assert area_px["width"] * area_px["height"] >= 0.65 * 1440 * 900
-    across, down = (np.flatnonzero((line != shown[0, 0]).any(axis=1)) for line in (shown[390], shown[:, 540]))
+    across, down = (np.flatnonzero((line != drawn[0, 0]).any(axis=1)) for line in (drawn[390], drawn[:, 540]))
     assert max(np.ptp(across) / area_px["width"], np.ptp(down) / area_px["height"]) >= 0.8
     page.keyboard.press("t")
     count(page.get_by_role("complementary"), 0)

@@ -229,7 +229,8 @@ def test_a_board_can_be_measured_when_its_poses_are_shot_and_once(bench: Calibra
     bench.calibrations.solve(session_id, measured_mm=(1.002 * across_mm, down_mm))
     bench.until_session(session_id, lambda record: record.state is SessionState.SOLVED)
     used = bench.tame.boards[-1]
-    assert (used, used.square_mm) == (bench.record(session_id).board, pytest.approx(1.002 * BOARD.square_mm))
+    assert used == bench.record(session_id).board
+    assert used.square_mm == pytest.approx(1.002 * BOARD.square_mm)
     with pytest.raises(CalibrationStateError, match="was measured already"):
         bench.calibrations.solve(session_id, measured_mm=(across_mm, down_mm))
 

@@ -18,8 +18,8 @@ from slrig.calibration.poses.checks import LIMITS
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import PatternError, PoseRefusedError, TurntableRefusedError
 from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Size, White
-from tests.unit.calibrate.calibration_bench import tame_calibration
 from tests.unit.calibrate.shot_boards import BOARD, Standing, both, patterns_for, position_at, shot, truth_of
+from tests.unit.scan.fakes import tame_calibration
 
 ENDS = patterns_for(Size(384, 240))[:2]
 """White and black."""

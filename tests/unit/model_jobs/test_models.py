@@ -53,10 +53,9 @@ from slrig.scan.job import plan_from_json as scan_plan_from_json
 from slrig.scan.job import plan_json as scan_plan_json
 from slrig.scan.job import series
 from slrig.scan.plan import ScanPlan
-from tests.unit.calibrate.calibration_bench import tame_calibration
 from tests.unit.capture.fake_rig import FakeTurntable
 from tests.unit.model_jobs.model_bench import ModelBench, kept_scan, model_files, until_told
-from tests.unit.scan.fakes import WAIT_S, TameProjector
+from tests.unit.scan.fakes import WAIT_S, TameProjector, tame_calibration
 
 AXIS = StatedAxis((4.0, 45.0, 12.0), (0.0, -1.0, 0.0))
 STILL = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))

@@ -346,10 +346,12 @@ def test_pulses_during_the_readout_are_taken_though_the_camera_takes_none_by_def
     class Pulsing(Stage):
         """Sends the next pulse while the sensor is read out."""
 
-        def exposed(self, t_start_ns: int, t_end_ns: int, *, gain: float = 1.0) -> Pixels:
+        def exposed(
+            self, t_start_ns: int, t_end_ns: int, *, gain: float = 1.0, readout_ns: int = 0, defocus_px: float = 0.0
+        ) -> Pixels:
             if len(memory.exposures) == 1:
                 memory.pulse()
-            return super().exposed(t_start_ns, t_end_ns, gain=gain)
+            return super().exposed(t_start_ns, t_end_ns, gain=gain, readout_ns=readout_ns, defocus_px=defocus_px)
 
     memory = MemoryCamera(Pulsing(scene()))
     with gentl_bench.serving(memory) as producer:

@@ -43,6 +43,11 @@ def changed(name: str, **more: object) -> tuple[Control, ...]:
     return tuple({**known, **more} if known["name"] == name else known for known in CONTROLS)
 
 
+def virtual(device: VirtualDevice) -> VirtualClock:
+    assert isinstance(device.clock, VirtualClock)
+    return device.clock
+
+
 def armed(device: VirtualDevice, settings: CameraSettings | None = None, **options: object) -> V4L2Camera:
     camera = device.open_camera(**{**FAST, **options})
     camera.configure(settings or CameraSettings(0.002, 1.0))
@@ -455,7 +460,7 @@ def test_lost_frames_are_counted_and_idle_ones_are_not(plugged: Plug) -> None:
     whole = plugged()
     camera = armed(whole)
     first = camera.read(0, 2)
-    whole.clock.advance(0.2)
+    virtual(whole).advance(0.2)
     later = camera.read(whole.clock.now_ns(), 2)
     assert later.sequence_number - first.sequence_number > 20
     assert later.dropped_count == 0
@@ -515,7 +520,7 @@ def test_an_unplugged_camera_is_reported_at_every_step(plugged: Plug, fault: str
     device = plugged()
     camera = armed(device)
     now_ns = device.clock.now_ns()
-    device.clock.call_at(now_ns + 100_000_000 * waits, lambda: device.fault(fault))
+    virtual(device).call_at(now_ns + 100_000_000 * waits, lambda: device.fault(fault))
     with pytest.raises(DeviceGoneError, match="plug it in again"):
         camera.read(now_ns + 10**12, 30)
     assert device.clock.now_ns() - now_ns <= 200_000_000
@@ -539,7 +544,7 @@ def test_closing_from_another_thread_ends_a_read(plugged: Plug) -> None:
         closing.start()
         assert camera._state.closed.wait(10)
 
-    device.clock.call_at(device.clock.now_ns() + 100_000_000, close)
+    virtual(device).call_at(device.clock.now_ns() + 100_000_000, close)
     with pytest.raises(DeviceStateError, match="closed"):
         camera.read(device.clock.now_ns() + 10**15, 10**5)
     closing.join()
