@@ -3,10 +3,8 @@ import {html} from "./vendor/preact-htm.js";
 import {Tests} from "./examine.js";
 import {FileText, Reopen, Settings} from "./rigfile.js";
 import {useAction, useValue} from "./service.js";
-import {Action, Badge, Facts, Refusal, moment} from "./ui.js";
+import {Action, Badge, Facts, Refusal, duration, moment, number} from "./ui.js";
 
-const short = (value) => Number(value.toPrecision(3));
-const duration = (seconds) => (seconds < 1e-3 ? `${short(1e6 * seconds)}\u00a0µs` : seconds < 1 ? `${short(1e3 * seconds)}\u00a0ms` : `${short(seconds)}\u00a0s`);
 const between = ([least, most], words) => (least === most ? `${words(least)} only` : `${words(least)} to ${words(most)}`);
 
 export function DevicesScreen({rig, again, may}) {
@@ -42,9 +40,9 @@ function Camera({camera}) {
   return html`<h3>Camera ${camera.name}</h3>
     <${Facts} of=${[
       ["Exposure in use", set ? duration(camera.exposure_s) : "not set yet"],
-      ["Gain in use", set ? short(camera.gain) : "not set yet"],
+      ["Gain in use", set ? number(camera.gain) : "not set yet"],
       ["Exposures it takes", between(camera.exposure_range_s, duration)],
-      ["Gains it takes", between(camera.gain_range, short)],
+      ["Gains it takes", between(camera.gain_range, (value) => number(value))],
       ["Model", camera.model],
       ["Serial number", camera.serial || null],
       ["Pixels", `${camera.size_px.join(" × ")}, ${camera.bit_depth} bits`],

@@ -5,7 +5,7 @@ import {Axis} from "./axis.js";
 import {Proposed} from "./rigfile.js";
 import {Running} from "./running.js";
 import {ask, once, useAction, useValue} from "./service.js";
-import {Action, Badge, Facts, Refusal, moment} from "./ui.js";
+import {Action, Badge, Facts, Refusal, begun, duration, moment} from "./ui.js";
 
 const SEVERITIES = {fault: ["bad", "Fault"], note: ["warn", "Note"], ok: ["good", "Good"]};
 const OUTCOMES = {failed: "Failed", "not run": "Not run"};
@@ -58,11 +58,11 @@ function Examine({kind, rig, may, ended}) {
     <${Refusal} problem=${refused} />`;
 }
 
-const sentence = (text) => `${text[0].toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
+const sentence = (text) => `${begun(text)}${/[.!?]$/.test(text) ? "" : "."}`;
 
 function Findings({of}) {
   return html`<ul class="findings">${of.map((each) => html`<li>
-    <p><${Badge} kind=${SEVERITIES[each.severity][0]}>${SEVERITIES[each.severity][1]}<//> <strong>${sentence(each.subject).slice(0, -1)}</strong></p>
+    <p><${Badge} kind=${SEVERITIES[each.severity][0]}>${SEVERITIES[each.severity][1]}<//> <strong>${begun(each.subject)}</strong></p>
     <p>${sentence(each.found)}</p>
     ${each.remedy && html`<p><strong>What to do:</strong> ${sentence(each.remedy)}</p>`}</li>`)}</ul>`;
 }
@@ -75,16 +75,14 @@ function Doctor({at, found}) {
     <details><summary>What is well: ${well.length}</summary><${Findings} of=${well} /></details>`;
 }
 
-const ms = (seconds) => (Number.isFinite(seconds) ? `${(1000 * seconds).toFixed(2)}\u00a0ms` : null);
-
 function Latency({at, found}) {
   const {synchronisation: whole, cameras} = found;
   return html`<p class="quiet">Measured ${moment(at)}</p>
-    <${Facts} of=${[["Light comes after the projector says so", `${ms(whole.latency_s)}, and up to ${ms(whole.latency_error_s)} more`]]} />
+    <${Facts} of=${[["Light comes after the projector says so", `${duration(whole.latency_s)}, and up to ${duration(whole.latency_error_s)} more`]]} />
     ${Object.entries(cameras).map(([name, each]) => html`<h4>By camera ${name}</h4><${Facts} of=${[
-      ["Mean, of the flashes", `${ms(each.latency_s)} ± ${ms(each.standard_error_s)}`], ["It varies by (σ)", ms(each.jitter_s)],
-      ["To white, to black", each.rise_s === null || each.fall_s === null ? null : `${ms(each.rise_s)}, ${ms(each.fall_s)}`],
-      ["Shutter", each.rolling ? `rolling, ${ms(each.skew_s)} from the first row to the last` : each.scanned ? "the projector builds its picture row by row" : "global"],
+      ["Mean, of the flashes", `${duration(each.latency_s)} ± ${duration(each.standard_error_s)}`], ["It varies by (σ)", duration(each.jitter_s)],
+      ["To white, to black", each.rise_s === null || each.fall_s === null ? null : `${duration(each.rise_s)}, ${duration(each.fall_s)}`],
+      ["Shutter", each.rolling ? `rolling, ${duration(each.skew_s)} from the first row to the last` : each.scanned ? "the projector builds its picture row by row" : "global"],
       ["Flashes used", `${each.flashes_used} of ${each.flashes}${each.late ? `, ${each.late} came late` : ""}`],
     ]} />${each.flicker > STEADY && html`<p class="warning">Steady white flickers. Make the exposure a multiple of the projector's refresh period.</p>`}`)}`;
 }
