@@ -105,7 +105,7 @@ def test_devices_are_shown_as_set_and_as_examined(start: Start, tmp_path: Path, 
     assert rig.with_name("rig.toml.bak").read_text() == measured
     # An editor takes it back, and the rig is opened by that.
     rig.write_text(measured)
-    here.get_by_role("button", name="Open the rig again").click()
+    here.get_by_role("button", name="Open the rig again", exact=True).click()
     doctor.get_by_text("The rig file holds what was measured.").wait_for()
     keep(service.data, "doctor", Diagnosis("small", findings, {}, None, None, None, None, ()).document())
 
@@ -125,7 +125,7 @@ def test_devices_are_shown_as_set_and_as_examined(start: Start, tmp_path: Path, 
     page.get_by_text("Logged in as Ann").wait_for()
     page.get_by_text("You may look.").wait_for()
     page.get_by_text("A key with the scope “administer” sees what is proposed").first.wait_for()
-    disabled(page.get_by_role("button", name="Open the rig again"))
+    disabled(page.get_by_role("button", name="Open the rig again", exact=True))
     count(page.get_by_role("table", name="Who did what last"), 0)
     fits(page)
     looks_as_elsewhere(page, "devices-phone-dark")
