@@ -53,6 +53,7 @@ _MIN_CONTRAST_SNR = 6.0  # no pixel exceeds it by chance
 
 _SETTLE_S = 0.1  # in addition to the declared and the measured latency
 _MAX_DARK_FRAMES = 64  # a limit in case the times of frames do not advance
+_STAYS_DARK_FRAMES = 3  # that a dark projector is looked at again
 _REFERENCE_FRAMES = 3  # of white and of black; the last two give the noise
 
 
@@ -356,8 +357,11 @@ class ArmedCamera:
         return level
 
     def expect_dark(self, when: str) -> None:
-        """Expect that the projector is dark. Raises ExpectationError."""
+        """Expect that the projector is dark, and stays so. Raises ExpectationError."""
         level = self.darkest_level()
+        if level <= MAX_BLACK_LEVEL:
+            # A sequence that goes on has dark patterns, too.
+            level = max(self.level(self.capture_current()) for _ in range(_STAYS_DARK_FRAMES))
         expect(
             level <= MAX_BLACK_LEVEL,
             expected=f"the projector is dark {when}",

@@ -68,7 +68,8 @@ def test_calibration_is_opened_shot_solved_and_used(calibrating: TestClient, ser
     assert (answer.status_code, answer.headers["Location"]) == (201, here)
     assert (made["state"], made["label"], made["poses"]) == ("open", "spring", 0)
     named = {"marker_mm": None, "dictionary": None, "square_sigma": 0.001, "aspect": 1.0}
-    assert made["board"] == {**BOARD, **named, "title": "chessboard 4x3, 10 mm"}
+    scales = {"rulers_mm": [50, 40], "measured": False}
+    assert made["board"] == {**BOARD, **named, **scales, "title": "chessboard 4x3, 10 mm"}
     # Both axes, and each bit with its inverse, unless the request says otherwise; the rest as the rig file says.
     assert made["patterns"]["rows"] is True
     assert made["patterns"]["sequence"] == "robust"
@@ -152,6 +153,8 @@ def test_board_is_the_usual_one_unless_it_is_named(
         "dictionary": "DICT_5X5_250",
         "square_sigma": 0.001,
         "aspect": 1.0,
+        "rulers_mm": [140, 100],
+        "measured": False,
         "title": "charuco 11x8, 12 mm",
     }
 

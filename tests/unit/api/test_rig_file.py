@@ -63,6 +63,7 @@ def test_what_the_doctor_measured_is_shown_as_a_difference_and_taken_over(
     assert any(line.startswith("+exposure_s = 0.0166667 # 1 × the refresh") for line in proposal["difference"])
     changed = client.put("/rig/file", json={"text": proposal["text"], "version": shown["version"]}).json()
     assert (changed["text"], changed["proposals"]) == (proposal["text"], [])
+    (served.service.folder.root / "doctor.json").unlink()
     assert [each.head is not None and each.head.exposure_s for each in opened] == [0.0166667]
     path = served.service.rig.path
     assert path.read_text() == proposal["text"]

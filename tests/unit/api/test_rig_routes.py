@@ -90,7 +90,7 @@ def test_a_verification_changes_the_health(health_client: TestClient) -> None:
     )
     plot = health_client.get("/rig/health.svg")
     assert plot.headers["content-type"].startswith("image/svg+xml")
-    assert "Expected error of a scan" in plot.text
+    assert "Change since calibration" in plot.text
 
 
 def test_a_busy_rig_names_its_holder(health_client: TestClient, verifying: Verifying) -> None:

@@ -379,7 +379,7 @@ def test_a_task_that_cannot_begin_in_time_is_refused_and_the_worker_goes_on(work
         return False
 
     waiting = threading.Thread(
-        target=worker.run, args=(task("wait_for", gate),), kwargs={"cancelled": began_and_goes_on}
+        target=worker.run, args=(task("wait_for", gate),), kwargs={"listener": Listener(cancelled=began_and_goes_on)}
     )
     waiting.start()
     assert began.wait(WAIT_S)
