@@ -340,7 +340,7 @@ def test_a_capture_that_failed_at_its_first_frame_leaves_the_cause(tmp_path: Pat
     folder = tmp_path / "bundle"
     with pytest.raises(ScanEvidenceError):
         cut_short(folder, keep=True, taken=False)
-    with pytest.raises(BundleError, match="there is no bundle.json in it"):
+    with pytest.raises(BundleError, match=r"there is no bundle\.json in it"):
         read_bundle(folder)
     assert [each.cause for each in read_refused(folder)] == ["stale"]
 

@@ -30,7 +30,11 @@ where one panel of text is missing and all else is in its place, 0.37 where all 
 that is mirrored, black, gone or of other colours.
 """
 
-_LOADED = "(all) => Promise.all(all.map((each) => each.decode().catch(() => {})))"
+# A picture below the window that is loaded when it is scrolled to would never be.
+_LOADED = """(all) => Promise.all(all.map((each) => {
+  each.loading = "eager";
+  return each.decode().catch(() => {});
+}))"""
 _FOLDER = Path(__file__).parent / "golden"
 _PHONE_PX = 600
 """Windows less wide than this are a phone's."""
