@@ -140,7 +140,7 @@ function Whole({model, rig, again, may}) {
     <div class="between"><${NameHeading} job=${model} kind="Model" may=${may("scan")} again=${again}><${JobBadge} state=${model.state} /><//>
       ${Object.keys(files).length > 0 && html`<${Downloads} files=${files} />`}</div>
     <div class="two">
-      <section aria-label="Mesh">
+      <section aria-label="Model">
         ${!done && html`<div class="box"><${Progress} label=${told.stage} fraction=${told.fraction} detail=${told.detail} />
           </div>`}
         ${!done && model.plan.shoot?.manual && may("scan") && html`<${Hand} model=${model} rig=${rig} may=${may} told=${told} views=${views} again=${again} />`}

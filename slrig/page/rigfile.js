@@ -32,9 +32,11 @@ export function Proposed({kind, file, rig, may, changed}) {
   if (!may("administer")) return html`<p class="quiet">A key with the scope “administer” sees what is proposed for the rig file.</p>`;
   if (!file) return null;
   const why = hindrance({file, rig, may});
+  // Of a file that was changed since there is nothing to undo.
+  const undoable = before?.version === file.version;
   if (!proposal)
-    return html`<p class="quiet" role="status">${before ? "Applied. The rig was opened again with the new file." : "The rig file holds what was measured."}
-      ${before && html` <${Action} busy=${undoing} disabled=${Boolean(why)} onClick=${undo}>Undo<//>`}</p><${Refusal} problem=${kept} />`;
+    return html`<p class="quiet" role="status">${undoable ? "Applied. The rig was opened again with the new file." : "The rig file holds what was measured."}
+      ${undoable && html` <${Action} busy=${undoing} disabled=${Boolean(why)} onClick=${undo}>Undo<//>`}</p><${Refusal} problem=${kept} />`;
   const [more, less] = ["+", "-"].map((sign) => proposal.difference.filter((line) => line.startsWith(sign)).length);
   return html`<h3>Proposed for the rig file</h3>
     <pre class="difference" tabindex="0" role="region" aria-label="Difference from the rig file">${proposal.difference.map((line) => html`<span class=${KINDS[line[0]] ?? ""}>${line}</span>`)}</pre>

@@ -235,7 +235,7 @@ def test_the_region_of_a_scan_is_named_and_drawn(service: ServiceProcess, visit:
     page.get_by_label("Greatest σ, mm").fill("0.5")
     page.get_by_text(
         re.compile(
-            r"a box, x -20 to 20, y -25 to 15, z .* mm; depths of 100 to 1000 mm; contrasts above 4 %; σ up to 0.5 mm"
+            r"a box, x -20 to 20, y -25 to 15, z .* mm; depths of 100 to 1000 mm; contrasts above 4\s%; σ up to 0.5\smm"
         )
     ).wait_for()
     assert violations(page) == []

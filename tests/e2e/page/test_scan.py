@@ -36,6 +36,9 @@ def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit:
     page.get_by_role("button", name="Look and propose").click()
     page.get_by_text("of what is lit can be read").wait_for()
     assert violations(page) == []
+    # The rig is free again, and its picture comes back.
+    page.get_by_text("% saturated").wait_for()
+    page.get_by_role("button", name="Scan", exact=True).and_(page.locator(":enabled")).wait_for()
     looks_as_kept(page, "scan")
     page.get_by_role("button", name="As the rig is set").click()
     page.get_by_role("button", name="Off").click()

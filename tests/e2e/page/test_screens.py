@@ -106,7 +106,7 @@ def test_devices_are_shown_as_set_and_as_examined(start: Start, tmp_path: Path, 
     # An editor takes it back, and the rig is opened by that.
     rig.write_text(measured)
     here.get_by_role("button", name="Open the rig again", exact=True).click()
-    doctor.get_by_text("The rig file holds what was measured.").wait_for()
+    doctor.get_by_text("Applied. The rig was opened again").wait_for()
     keep(service.data, "doctor", Diagnosis("small", findings, {}, None, None, None, None, ()).document())
 
     # On a phone, by a key for looking.
