@@ -269,7 +269,8 @@ class Service:
         """Give a job another label, on record and beside its files. Raises JobNotFoundError, StorageError."""
         place = self.manager.kinds[kind].place_of(self.store.get(job_id, kind), self.folder)
         keep = partial(self.folder.relabel, job_id, place, label)
-        return self.store.rename(job_id, kind, label=label, keep=keep)
+        with self.folder.naming:
+            return self.store.rename(job_id, kind, label=label, keep=keep)
 
     def _usual_scan(self, preset: str | None) -> ScanJob:
         found = None if preset is None else self.presets.get(preset)

@@ -175,6 +175,8 @@ class DataFolder:
         self._free = free
         self._whole: dict[Path, tuple[int, int, int]] = {}
         self._noting = threading.Lock()
+        # Files that are moved to their place get no new label meanwhile.
+        self.naming = threading.Lock()
         with disk_errors(self.root):
             self.root.mkdir(parents=True, exist_ok=True)
             # Whichever thread ends the service lets it go; a kernel that cannot lock is a refusal, not a makeshift.
@@ -350,7 +352,7 @@ class DataFolder:
         its end was on record is removed.
         """
         staged = self.staging(job_id)
-        with disk_errors(staged):
+        with self.naming, disk_errors(staged):
             result = self.result(job_id)
             if result.is_dir():
                 for file in sorted(result.iterdir()):
@@ -383,7 +385,10 @@ class DataFolder:
             write_file(place / MADE, _entries_adapter.dump_json(made))
 
     def relabel(self, job_id: UUID, place: Path | None, label: str | None) -> None:
-        """Keep the new label of a job with its files, where they are or where they are made. Raises StorageError."""
+        """Keep the new label of a job with its files, where they are or where they are made. Hold `naming` meanwhile.
+
+        Raises StorageError.
+        """
         # In the order in which `put` moves them.
         for folder in (self.staging(job_id), place):
             if folder is not None and folder.is_dir():

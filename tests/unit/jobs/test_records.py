@@ -108,7 +108,7 @@ def asked(preset: str) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("wanted", "found"),
     [
-        ({"name": "GRÖSSE_"}, [1]), ({"name": "0"}, [2, 1, 0]), ({"name": "%"}, []), ({"name": "ID"}, [2]),
+        ({"name": "GRÖSSE_"}, [1]), ({"name": "LATE-00"}, [2, 0]), ({"name": "%"}, []), ({"name": "ID"}, [2]),
         ({"states": [JobState.FAILED, JobState.CAPTURING]}, [2, 0]), ({"rig": "hall"}, [3]), ({"preset": "shiny"}, [1]),
         ({"since": hours_on(1), "until": hours_on(3)}, [2, 1]), ({"name": "0", "preset": "dark", "until": NOON}, []),
     ],
