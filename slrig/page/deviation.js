@@ -1,4 +1,5 @@
 // A worker: how far each vertex of a mesh is from another mesh, with the sign of the side. Message {of, from}, answer {values: Float32Array}.
+import {cross, dot} from "./vectors.js";
 
 /** Cells are so many times as wide as the other mesh's vertices lie apart, and so many of them are looked at on each side. */
 const CELL_SPACINGS = 1.5;
@@ -126,7 +127,7 @@ function offTriangles(points, corners, {starts, members}, vertex, point) {
   let value = NOT_KNOWN;
   for (let each = starts[vertex]; each < starts[vertex + 1]; each += 1) {
     const [a, b, c] = [0, 1, 2].map((at) => 3 * corners[members[each] + at]).map((at) => [points[at], points[at + 1], points[at + 2]]);
-    const normal = crossed(less(b, a), less(c, a));
+    const normal = cross(less(b, a), less(c, a));
     const size = Math.hypot(...normal);
     if (!size) continue;
     const away = less(point, nearestOn(a, b, c, point));
@@ -140,8 +141,6 @@ function offTriangles(points, corners, {starts, members}, vertex, point) {
 }
 
 const less = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const crossed = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const between = (a, b, share) => a.map((each, axis) => each + share * (b[axis] - each));
 
 /** The point of a triangle that is nearest to a point (Ericson 2005, "Real-Time Collision Detection", section 5.1.5). */

@@ -1,4 +1,5 @@
 // What is measured on a mesh, each with its standard deviation: distances, planes, balls, cylinders, sections. Nothing here draws.
+import {cross, dot} from "./vectors.js";
 
 /** A standard deviation that is not known, as it is stored. */
 const UNKNOWN = 65535;
@@ -14,8 +15,6 @@ const DIRECTIONS = 600;
 const LEAST_POINTS = 20;
 
 const add = (a, b, factor = 1) => a.map((each, axis) => each + factor * b[axis]);
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const unit = (a) => a.map((each) => each / Math.hypot(...a));
 const apart = (a, b) => Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
 const median = (values) => [...values].sort((a, b) => a - b)[values.length >> 1];

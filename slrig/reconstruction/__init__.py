@@ -23,6 +23,7 @@ from slrig.reconstruction.calibration_check import (
     find_camera_pairs,
     find_correspondences,
     find_cross_line_pairs,
+    read_pairs,
     share_in_front,
 )
 from slrig.reconstruction.camera_response import estimate_noise
@@ -164,6 +165,7 @@ __all__ = [
     "position_map",
     "project",
     "projector_positions",
+    "read_pairs",
     "reference_repeats",
     "refine_pose",
     "sample_format",

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from slrig.model import Axis, FloatArray, Gray, LineShift, Pinhole, Size, from_gray, to_gray
 from slrig.reconstruction.identification import StripeEnsemble
 from slrig.reconstruction.phase import has_phase
-from slrig.reconstruction.second_axis import SecondAxis, find_crossings, sample_image
+from slrig.reconstruction.second_axis import AxisPositions, SecondAxis, find_crossings, sample_image
 from slrig.reconstruction.triangulation import pixel_rays, project
 
 _MAX_POINTS = 20_000  # of a check; their mean is known to a hundredth of their scatter
@@ -104,15 +104,25 @@ def find_correspondences(ensemble: StripeEnsemble, second: SecondAxis, axis: Axi
     if len(points) == 0 or np.isfinite(second.positions.sample(points)[0]).mean() < _MIN_READ:
         return PixelPairs(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), axis)
     if has_phase(second.frames):
-        step = max(1, len(points) // _MAX_POINTS)
-        points, coded = points[::step], coded[::step]
-        other, sigma = second.positions.sample(points)
-        known = np.isfinite(other)
-        points, coded, other, sigma = points[known], coded[known], other[known], sigma[known]
-    else:
-        index, share, other = second.edges(points, ensemble.ends)
-        points = points[index] + share[:, None] * (points[index + 1] - points[index])
-        coded, sigma = coded[index], np.full(len(index), _EDGE_SIGMA_PX)
+        return read_pairs(ensemble, second.positions, axis, step=max(1, len(points) // _MAX_POINTS))
+    index, share, other = second.edges(points, ensemble.ends)
+    points = points[index] + share[:, None] * (points[index + 1] - points[index])
+    return _paired(points, coded[index], other, np.full(len(index), _EDGE_SIGMA_PX), axis)
+
+
+def read_pairs(ensemble: StripeEnsemble, positions: AxisPositions, axis: Axis, *, step: int = 1) -> PixelPairs:
+    """Projector pixels of every `step`-th stripe point at which the second axis is read, between code edges, too.
+
+    axis : the one that numbers the stripes.
+    """
+    points = ensemble.points_px[::step]
+    coded = np.repeat(ensemble.position_px, np.diff(ensemble.offsets))[::step]
+    other, sigma = positions.sample(points)
+    return _paired(points, coded, other, sigma, axis).take(np.isfinite(other))
+
+
+def _paired(points: FloatArray, coded: FloatArray, other: FloatArray, sigma: FloatArray, axis: Axis) -> PixelPairs:
+    """coded, other : positions along the axis that numbers the stripes, and along the second one."""
     pair = (coded, other) if axis is Axis.COLUMN else (other, coded)
     return PixelPairs(points, np.column_stack(pair), sigma, axis)
 

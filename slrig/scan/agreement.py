@@ -39,6 +39,7 @@ from slrig.reconstruction import (
     intersect_light_sheets,
     merge_curves,
     noise_px,
+    read_pairs,
     refine_pose,
     select_points,
     sheet_coordinates,
@@ -129,12 +130,7 @@ def _all_pairs(camera: CameraResult, second: SecondAxisResult) -> PixelPairs:
     """Camera and projector pixels at all points of the stripes, or where they cross code edges if all that is read."""
     if not second.is_dense or second.positions is None:
         return second.pairs
-    ensemble = camera.curves.ensemble
-    coded = np.repeat(ensemble.position_px, np.diff(ensemble.offsets))
-    other, sigma = second.positions.sample(ensemble.points_px)
-    pair = (coded, other) if second.pairs.axis is Axis.COLUMN else (other, coded)
-    pairs = PixelPairs(ensemble.points_px, np.column_stack(pair), sigma, second.pairs.axis)
-    return pairs.take(np.isfinite(other))
+    return read_pairs(camera.curves.ensemble, second.positions, second.pairs.axis)
 
 
 def _refutation(agreement: AxisAgreement, name: str, check: CalibrationCheck) -> str:
