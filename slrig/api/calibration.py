@@ -128,7 +128,7 @@ class SolveRequest(Strict):
         "held-out poses are better with that",
     )
     measured_mm: Rulers | None = Field(
-        default=None, description="of a board whose size nobody measured before, as in POST /calibration"
+        default=None, description="for a board that was not measured when the session began: as in POST /calibration"
     )
 
 

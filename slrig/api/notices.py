@@ -1,4 +1,4 @@
-"""/notices: who is told of what needs a person, and how it was told."""
+"""/notices: the receivers of notices, the webhook, and test notices."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ReceiverName = Annotated[str, Path(max_length=64, description="of the receiver, 
 
 
 class ReceiverBody(BaseModel):
-    """A receiver of notices. Of its address only the host is told: the rest often holds a secret."""
+    """A receiver of notices. Only the host of its address is shown: the rest often contains a secret."""
 
     name: str
     host: str
@@ -30,7 +30,7 @@ class ReceiverBody(BaseModel):
 
 
 class ReceiverList(BaseModel):
-    """Everybody who is told."""
+    """All receivers of notices."""
 
     receivers: list[ReceiverBody]
 
@@ -46,7 +46,7 @@ class TrialBody(BaseModel):
 
 @router.get("")
 def list_receivers(service: Serving) -> ReceiverList:
-    """List who is told of failed and missed runs, of changes of the rig's health and of jobs that ended."""
+    """List the receivers of notices: of failed and missed runs, changes of the rig's health, and finished jobs."""
     return _receivers(service)
 
 
@@ -67,13 +67,13 @@ def remove_webhook(service: Serving) -> None:
 
 @router.post("/{receiver}/test", responses=problems(422))
 def send_test_notice(service: Serving, receiver: ReceiverName) -> TrialBody:
-    """Send a notice that tells of nothing, at once and once, and tell how it went: after 15 s at the latest."""
+    """Send one test notice now and return the result, within 15 s."""
     return filled(TrialBody, service.receivers.get(receiver).try_out())
 
 
 def _receivers(service: Service) -> ReceiverList:
     outbox, found = service.store.outbox, []
-    for name, sender in [*service.receivers.open.items()]:
+    for name, sender in [*service.receivers.senders.items()]:
         waiting, oldest_s = outbox.waiting(name)
         found.append(
             ReceiverBody(

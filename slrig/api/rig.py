@@ -180,7 +180,8 @@ async def look_through_camera(
         Query(
             gt=0,
             le=LONGEST_S,
-            description="of this camera, as near as it can, for all who look, whoever asked last; scans keep theirs. "
+            description="exposure of the live picture, or the nearest that the camera can take. All viewers of the "
+            "camera get the last one requested; scans keep their own. "
             "Default: the rig file's",
         ),
     ] = None,

@@ -80,7 +80,7 @@ class RigFileBody(BaseModel):
 
     path: str
     text: str
-    version: str = Field(description="a change names it, so that nobody's is lost")
+    version: str = Field(description="of the text; a change must name it, so that it overwrites no newer one")
     refused: str | None = Field(description="why the service cannot change it; null where it can")
     fault: str | None = Field(description="why the rig cannot be opened by it")
     settings: RigSettings | None = Field(description="null where it has a fault")
@@ -128,7 +128,7 @@ def replace_rig_file(service: Serving, request: Annotated[RigFileRequest, Body()
 
 @router.put("/settings", responses=problems(409, 429, 502, 503, 507))
 def change_settings(service: Serving, request: Annotated[SettingsRequest, Body()]) -> RigFileBody:
-    """Change exposures, gains and what is wanted of scans in the rig file, and open the rig anew: see PUT /rig/file."""
+    """Change exposures, gains and requirements on scans in the rig file, and reopen the rig: see PUT /rig/file."""
     text = read_text(service.rig.path, MAX_CONFIG_BYTES, ConfigError)
     _require_settings(service, rig_of(text, service.rig.path), request)
     _change(service, _with_settings(text, request), version=request.version)

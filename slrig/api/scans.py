@@ -69,7 +69,7 @@ class ScanQuery(BaseModel):
     """Which scans a page is to have: of all that are on record, or of those that are as it says."""
 
     name: Annotated[SafeText, Field(max_length=200)] | None = Field(
-        default=None, description="a part of the name, in whatever case, or the beginning of the id"
+        default=None, description="part of the name, upper or lower case, or the start of the id"
     )
     state: list[JobState] = Field(default=[], description="one of these; may be repeated")
     since: AwareMoment | None = Field(default=None, description="created at this moment or later")

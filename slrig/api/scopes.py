@@ -33,8 +33,8 @@ RIG_FILE = ("/rig/file", "/rig/settings")
 
 
 def needed_scope(method: str, path: str) -> KeyScope:
-    """What a key must be for to send this request: reading is looking, but for a preview, which takes the rig, and for
-    the rig file.
+    """The scope that a key needs for a request. Reading needs `look`, except a preview, which uses the rig, and the rig
+    file.
 
     >>> [str(needed_scope("GET", path)) for path in ("/scan", "/preview/left", "/audit")]
     ['look', 'scan', 'administer']

@@ -168,7 +168,7 @@ class Service:
         The disk refused. What was given is still the caller's to close.
     ConfigError
         A plug-in cannot be loaded, or what it needs is not installed. Or a receiver of notices
-        cannot be told: see `Receivers`. Or the catalogue has no address, or no login.
+        cannot be opened: see `Receivers`. Or the catalogue has no address, or no login.
     ExtraMissingError
         The catalogue's driver is not installed.
     """

@@ -74,7 +74,7 @@ class Scans(Resource):
     ) -> Json:
         """A page of scans from new to old: `scans`, and `next`, the path of the page after it.
 
-        name : a part of the name, in whatever case, or the beginning of the id. state : one of these. since, until :
+        name : part of the name, upper or lower case, or the start of the id. state : one of these. since, until :
         when they were created, ISO 8601 with the offset from UTC; the latter is excluded. rig, preset : by their names.
         """
         asked = given(name=name, state=state, since=since, until=until, rig=rig, preset=preset)
@@ -739,7 +739,7 @@ class Schedules(Resource):
 
 
 class Notices(Resource):
-    """Who is told of failed and missed runs, of changes of the rig's health and of jobs that ended."""
+    """Receivers of notices: of failed and missed runs, changes of the rig's health, and finished jobs."""
 
     def list(self) -> Json:
         """The receivers: host, kinds of notices, and how many wait."""
@@ -754,7 +754,7 @@ class Notices(Resource):
         self._connection.send("DELETE", "/notices/webhook")
 
     def test(self, receiver: str) -> Json:
-        """Send a notice that tells of nothing, once, and tell how it went."""
+        """Send one test notice, and return the result."""
         return self._connection.json("POST", path("/notices/{}/test", receiver))
 
 

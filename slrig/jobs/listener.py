@@ -1,4 +1,4 @@
-"""Who follows a call that takes long: is told how far it is, and says whether it is to go on."""
+"""Progress and cancellation of a long call."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ def _unheard(_file: str) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Listener:
-    """report : takes the stage, the fraction of the whole call that is done, 0 to 1, and a detail for people. cancelled
+    """Receives the progress of a long call, and can cancel it.
+
+    report : takes the stage, the fraction of the whole call that is done, 0 to 1, and a detail for people. cancelled
     : whether the call is to end early, by ScanCancelledError. file_ready : takes the name of a file that can be fetched
     before the call is over.
     """
@@ -56,4 +58,4 @@ class Listener:
 
 
 SILENT = Listener()
-"""Nobody follows the call, and it goes on to its end."""
+"""Ignores progress, and never cancels."""

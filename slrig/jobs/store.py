@@ -368,7 +368,7 @@ class JobStore:
     ) -> Sequence[JobRecord]:
         """Return up to `limit` jobs, newest first, whose number is below `before`, of those that are asked for.
 
-        name : a part of the label, in whatever case, or the beginning of the id. since, until : when they were created,
+        name : part of the label, upper or lower case, or the start of the id. since, until : when they were created,
         the latter excluded. rig, preset : by their names.
         """
         query = _jobs(*kinds).order_by(JobRow.number.desc()).limit(limit)

@@ -1,4 +1,4 @@
-// Alerts: who is told of what needs a person, and a notice sent to see whether it arrives.
+// Alerts: the receivers of notices, and a test notice.
 import {html, useState} from "./vendor/preact-htm.js";
 import {ask, useAction, useValue} from "./service.js";
 import {Action, Badge, Refusal, duration} from "./ui.js";

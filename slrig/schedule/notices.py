@@ -182,7 +182,7 @@ class Sender(ABC):
         return 0.0
 
     def try_out(self) -> Trial:
-        """Send a notice that tells of nothing, once, before those that wait."""
+        """Send one test notice, before the notices that wait."""
         notice = Notice(0, "", self._outbox.body("test", "this is a test notice; nothing has happened"))
         notice = replace(notice, id=notice.body["id"])
         begun_s = time.monotonic()
@@ -314,15 +314,15 @@ class WebhookEntry(Strict):
 
 
 class Receivers:
-    """Who is told of notices: those of the settings, and a webhook that was set by request. Any thread may call.
+    """The receivers of the settings, and a webhook that was set by request. Any thread may call.
 
-    `open` has the sender of each, by its name; `fixed` the names that the settings give. Raises ConfigError: see
+    senders : by the name of the receiver; fixed : names of receivers that the settings give. Raises ConfigError: see
     `senders_of`.
     """
 
     def __init__(self, settings: ServiceSettings, outbox: Outbox, root: Path) -> None:
-        self.open = {sender.receiver: sender for sender in senders_of(settings, outbox)}
-        self.fixed = frozenset(self.open)
+        self.senders = {sender.receiver: sender for sender in senders_of(settings, outbox)}
+        self.fixed = frozenset(self.senders)
         self._settings, self._outbox, self._path = settings, outbox, root / "webhook.json"
         self._lock = threading.Lock()
         self._started = False
@@ -339,20 +339,22 @@ class Receivers:
     def start(self) -> None:
         """Begin to send."""
         self._started = True
-        for sender in self.open.values():
+        for sender in self.senders.values():
             sender.start()
 
     def close(self) -> None:
         """See `Sender.close`."""
-        for sender in filter(None, (*self.open.values(), self._webhook)):
+        for sender in filter(None, (*self.senders.values(), self._webhook)):
             sender.close()
 
     def get(self, name: str) -> Sender:
         """A receiver. Raises ConfigError."""
-        if name not in self.open:
-            message = f"There is no receiver '{name}', but: {', '.join(self.open) or 'none'}. GET /notices lists them."
+        if name not in self.senders:
+            message = (
+                f"There is no receiver '{name}', but: {', '.join(self.senders) or 'none'}. GET /notices lists them."
+            )
             raise ConfigError(message)
-        return self.open[name]
+        return self.senders[name]
 
     def set_webhook(self, entry: WebhookEntry) -> None:
         """Send to this address from now on, also after a restart. Raises ConfigError: the settings have one."""
@@ -368,7 +370,7 @@ class Receivers:
         with self._lock:
             self._path.unlink(missing_ok=True)
             self._outbox.want(Webhook.receiver, ())
-            self.open.pop(Webhook.receiver, None)
+            self.senders.pop(Webhook.receiver, None)
 
     def _require_free(self) -> None:
         if Webhook.receiver in self.fixed:
@@ -380,7 +382,7 @@ class Receivers:
         if self._webhook is None:
             self._webhook = Webhook(self._outbox, entry.url, _signing_key(self._settings))
         self._webhook.send_to(entry.url)
-        self.open[Webhook.receiver] = self._webhook
+        self.senders[Webhook.receiver] = self._webhook
         if self._started:
             self._webhook.start()
 

@@ -569,11 +569,11 @@ def test_a_webhook_is_set_tried_and_removed_while_the_service_runs(tmp_path: Pat
     with bench.database.changing() as session:
         outbox.put(session, "run.failed", "too late")
     again.remove_webhook()
-    assert (outbox.waiting("webhook")[0], outbox.wanted, again.open) == (0, {}, {})
-    assert not Receivers(ServiceSettings(), outbox, tmp_path).open
+    assert (outbox.waiting("webhook")[0], outbox.wanted, again.senders) == (0, {}, {})
+    assert not Receivers(ServiceSettings(), outbox, tmp_path).senders
     (tmp_path / "webhook.json").write_text("damaged")
     with structlog.testing.capture_logs() as log:
-        assert not Receivers(ServiceSettings(), outbox, tmp_path).open
+        assert not Receivers(ServiceSettings(), outbox, tmp_path).senders
     assert [each["event"] for each in log] == ["the webhook is not told of anything: set it again"]
 
     outbox = Outbox(bench.database, wanted={"webhook": ["run.failed"]})
