@@ -511,7 +511,7 @@ async def fetch_together(
         record = await run_in_threadpool(_whole_file, service, scan_id, file)
         called = saved_name(record, file)
         if called in named:
-            called = saved_name(replace(record, label=f"{record.label} {str(scan_id)[:8]}"), file)
+            called = saved_name(replace(record, label=f"{record.label or ''} {str(scan_id)[:8]}"), file)
         named[called] = path
     headers = {
         "Content-Disposition": disposition(f"{_slug(record.rig)}-{len(named)}-scans-{file}.zip", "attachment"),
