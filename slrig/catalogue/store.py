@@ -368,6 +368,8 @@ def open_catalogue(address: str, login: str | None, authority: Path | None) -> C
         pool_size=2,
         max_overflow=0,
         pool_timeout=1.0,
+        # A server that was started again has dropped the connections that are kept here.
+        pool_pre_ping=True,
         pool_logging_name=_POOL,
         connect_args={
             "timeout": PATIENCE_S,

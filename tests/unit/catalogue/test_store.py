@@ -201,6 +201,20 @@ def test_an_address_that_cannot_be_used_is_refused_and_not_repeated(address: str
 
 
 @pytest.mark.slow
+def test_a_server_that_was_started_again_costs_no_call() -> None:
+    with Postgres() as server:
+        catalogue = open_catalogue(server.address(), LOGIN, None)
+        catalogue.open()
+        server.kill()
+        server.start()
+        assert catalogue.fleet().rigs == ()
+        server.kill()
+        server.start()
+        catalogue.copy([job()])
+        catalogue.close()
+
+
+@pytest.mark.slow
 def test_a_certificate_has_to_be_of_the_authority_and_of_the_host(tmp_path: Path) -> None:
     pem = own_certificate(tmp_path)
     with Postgres(certificate=pem) as server:
