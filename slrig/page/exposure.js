@@ -53,7 +53,7 @@ export function Exposure({rig, figures, exposures_s, setExposures, request, robu
   return html`<div class="box exposure">
     ${figures && html`<div class="between">
       <span>${percent(figures.saturated)} saturated, ${percent(figures.dark)} too dark or in shadow</span>
-      <span class="quiet">${camera?.gain ? `Gain ${number(camera.gain)}` : ""}</span></div>
+      <span class="quiet">${camera?.gain ? html`Gain ${number(camera.gain)}, <a href="#/devices">change it</a>` : ""}</span></div>
       <${Histogram} levels=${figures.levels} />
       <label class="focus">Sharpness, of the best seen here <meter min="0" max="1" low="0.6" high="0.85" optimum="1" value=${figures.sharpness / (best.sharpness || 1)}></meter></label>`}
     ${slider && html`<label class="wide-label"><span class="between"><span>Exposure of the next scan</span><strong>${exposures_s?.length > 1 && moving === null ? times(exposures_s) : duration(now_s)}${exposures_s || moving !== null ? "" : ", as the rig is set"}</strong></span>

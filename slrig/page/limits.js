@@ -32,7 +32,7 @@ export function limitToBox(box) {
 export function Limits({typed, region, change, others, preset}) {
   const [open] = useState(region !== null);
   const of = (name) => ({value: typed[name] ?? "", change: (value) => change({[name]: value})});
-  return html`<details open=${open}><summary>Limit the scan</summary>
+  return html`<details class="panel" open=${open}><summary><h3>Limit the scan</h3></summary>
     <div class="row numbers"><${Field} label="Nearest depth, mm" ...${of("near")} /><${Field} label="Farthest depth, mm" ...${of("far")} /></div>
     <div class="row numbers"><${Field} label="Least contrast, %" ...${of("contrast")} max="100" /><${Field} label="Greatest σ, mm" ...${of("sigma")} /></div>
     <p class="quiet">${region ? `The next scan measures: ${limits(region)}. Other limits of the rig or a preset do not count then.`

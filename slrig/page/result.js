@@ -24,7 +24,7 @@ export function ResultScreen({id, may}) {
   return html`<${Result} scan=${scan} again=${again} may=${may} />`;
 }
 
-const Back = () => html`<p><a href="#/scan/all">All scans</a></p>`;
+const Back = () => html`<p><a href="#/scan/all">All scans</a> · <a href="#/scan">Live picture</a></p>`;
 
 function Result({scan, again, may}) {
   const {files} = scan.links;

@@ -1,4 +1,4 @@
-// Scan: what the cameras see, one large button, how far the scan is, and the scans so far.
+// Scan: what the cameras see fills the stage; beside it one large button, light and focus, and the scans so far.
 import {html, useEffect, useState} from "./vendor/preact-htm.js";
 import {Exposure} from "./exposure.js";
 import {Limits, useLimits} from "./limits.js";
@@ -7,8 +7,9 @@ import {NameField, called, useName} from "./names.js";
 import {whyNot} from "./ready.js";
 import {ask, follow, once, useAction, useValue} from "./service.js";
 import {Action, JobBadge, Progress, Refusal, begun, count, length} from "./ui.js";
+import {Panel, Workspace} from "./workspace.js";
 
-const SHOWN = 12;
+const SHOWN = 8;
 const SEQUENCES = {fast: "Fast: fewest frames", standard: "Standard", robust: "Robust: for what reflects or is hollow", phase: "Phase: few frames, in shades of grey"};
 const over = (scan) => !["queued", "capturing", "computing"].includes(scan.state);
 
@@ -35,32 +36,34 @@ export function ScanScreen({rig, may}) {
   });
   const blocked = whyNot(rig, may);
   const presets = known?.presets.filter(({fault}) => !fault) ?? [];
-  return html`<div class="two">
-    <section aria-label="Live picture">
-      <${Live} rig=${rig} may=${may} exposure_s=${exposures_s?.[0]} told=${setFigures} />
-    </section>
-    <section aria-label="Scan">
+  const stage = html`<${Live} rig=${rig} may=${may} exposure_s=${exposures_s?.[0]} told=${setFigures} />
+    ${active && html`<div class="over middle"><${UnderWay} key=${active.id} scan=${active} changed=${again} may=${may} /></div>`}`;
+  const last = scans.find((scan) => scan.triangles !== null);
+  return html`<${Workspace} label="Live picture" stage=${stage} top=${html`
+      ${last && html`<a class="action" href=${`#/scan/${last.id}`}>Last mesh</a>`}
+      <span class="alone"><${Action} kind="primary" busy=${busy} disabled=${Boolean(blocked)} onClick=${start}>Scan<//></span>`}>
+    <section aria-label="Scan" class="head">
+      <h2>New scan</h2>
       ${may("scan") && html`<${NameField} name=${name} change=${setName} entered=${() => blocked || start()} />`}
       <${Action} kind="primary large" busy=${busy} disabled=${Boolean(blocked)} aria-describedby=${blocked && "why-not"} onClick=${start}>Scan<//>
       ${blocked && html`<p id="why-not" class=${may("scan") ? "warning" : "quiet"}>${blocked.words} ${blocked.help && html`<a href=${blocked.help[0]}>${blocked.help[1]}</a>`}</p>`}
       ${rig?.error && html`<p class="warning">${rig.error} The next scan tries to open the rig again.</p>`}
+      <${Refusal} problem=${refused} />
+      ${!active && scans[0]?.error && html`<${Refusal} problem=${{document: {title: "The last scan failed"}, message: scans[0].error.detail}} />`}
       ${may("scan") && html`<div class="row numbers">${known && html`<label>Preset <select value=${preset} onChange=${(event) => setPreset(event.target.value)}>
         <option value="">Rig default</option>${presets.map(({name, description}) => html`<option value=${name}>${begun(name)}${description ? `: ${description}` : ""}</option>`)}</select></label>`}
       <label>Patterns <select value=${sequence} onChange=${(event) => setSequence(event.target.value)}>
         <option value="">${preset ? "Preset's, or rig default" : "Rig default"}</option>${Object.entries(SEQUENCES).map(([name, words]) => html`<option value=${name}>${words}</option>`)}</select></label></div>`}
-      ${may("scan") && rig?.cameras.length > 0 && html`<${Exposure} rig=${rig} figures=${figures} exposures_s=${exposures_s} setExposures=${setExposures} request=${patterned} robust=${sequence ? null : () => setSequence("robust")} />`}
-      ${may("scan") && html`<${Limits} typed=${typed} region=${region} change=${change} others=${preset ? null : rig?.scan_defaults?.region} preset=${preset} />`}
-      <${Refusal} problem=${refused} />
-      ${active && html`<${UnderWay} key=${active.id} scan=${active} changed=${again} may=${may} />`}
-      ${!active && scans[0]?.error && html`<${Refusal} problem=${{document: {title: "The last scan failed"}, message: scans[0].error.detail}} />`}
     </section>
-  </div>
-  <section aria-label="Recent scans">
-    <div class="between"><h2>Recent scans</h2><a href="#/scan/all">All scans</a></div>
-    <${Refusal} problem=${problem?.status ? problem : null} />
-    ${list && scans.length === 0 && html`<p class="quiet">No scans yet. Name the part, then press Scan.</p>`}
-    <ul class="cards">${scans.filter(over).map((scan) => html`<${Card} key=${scan.id} scan=${scan} />`)}</ul>
-  </section>`;
+    ${may("scan") && rig?.cameras.length > 0 && html`<${Panel} name="Exposure and focus"><${Exposure} rig=${rig} figures=${figures} exposures_s=${exposures_s} setExposures=${setExposures} request=${patterned} robust=${sequence ? null : () => setSequence("robust")} /><//>`}
+    ${may("scan") && html`<${Limits} typed=${typed} region=${region} change=${change} others=${preset ? null : rig?.scan_defaults?.region} preset=${preset} />`}
+    <section aria-label="Recent scans">
+      <div class="between"><h3>Recent scans</h3><a href="#/scan/all">All scans</a></div>
+      <${Refusal} problem=${problem?.status ? problem : null} />
+      ${list && scans.length === 0 && html`<p class="quiet">No scans yet. Name the part, then press Scan.</p>`}
+      <ul class="cards many">${scans.filter(over).map((scan) => html`<${Card} key=${scan.id} scan=${scan} />`)}</ul>
+    </section>
+  <//>`;
 }
 
 /** A scan on its way. When it was asked for here, its result is shown as soon as there is a mesh. */

@@ -334,8 +334,15 @@ def test_a_person_sees_many_rigs_at_once(start: Start, tmp_path: Path, visit: Vi
     catalogue.close()
 
 
-WRITTEN_IN = ("models", "calibrate", "health")
-"""Screens with something to fill in."""
+WRITTEN_IN = {
+    "scan": None,
+    "scan/all": None,
+    "models": None,
+    "calibrate": None,
+    "health": None,
+    "devices": "Change settings",
+}
+"""Screens with something to fill in, and what has to be opened before."""
 OVER = {"type": "/problems/unauthorized", "title": "Log in first", "status": 401, "detail": "The session is over."}
 COMPLAINT = "Failed to load resource"
 """What Chromium itself says of a request that is refused, or not answered."""
@@ -367,15 +374,17 @@ def test_a_camera_is_unplugged_and_a_key_expires(start: Start, tmp_path: Path, v
     page.get_by_label("Key").fill(secret)
     page.get_by_role("button", name="Enter").click()
     page.get_by_role("alert").get_by_text("This API key expired on").wait_for()
-    page.get_by_label("Key").fill(KEY)
+    page.get_by_label("Key", exact=True).fill(KEY)
     page.get_by_role("button", name="Enter").click()
     page.get_by_text("Logged in as environment").wait_for()
     assert page.url.endswith("#/devices")
 
     # On every screen the page says so, and keeps what is shown and was typed.
-    field = page.locator("#content input:is([type=number], [type=text]):visible").first
-    for screen in WRITTEN_IN:
+    field = page.locator("#content input:is(:not([type]), [type=number], [type=text], [type=search]):visible").first
+    for screen, folded in WRITTEN_IN.items():
         page.goto(f"{service.url}/#/{screen}")
+        if folded:
+            page.get_by_text(folded).click()
         field.fill("7")
         page.route("**/*", lambda route: route.abort())
         page.get_by_role("alert").get_by_text("The service does not answer.").wait_for()
@@ -385,7 +394,7 @@ def test_a_camera_is_unplugged_and_a_key_expires(start: Start, tmp_path: Path, v
         page.route("**/rig", lambda route: route.fulfill(status=401, json=OVER))
         page.get_by_role("alert").get_by_text("Your session is over").wait_for()
         page.unroute_all(behavior="ignoreErrors")
-        page.get_by_label("Key").fill(KEY)
+        page.get_by_label("Key", exact=True).fill(KEY)
         page.keyboard.press("Enter")
         field.wait_for()
         assert field.input_value() == "7", screen
@@ -415,6 +424,6 @@ def test_health_without_a_calibration_while_the_service_goes_and_comes_back(
     # Sessions live as long as the service.
     page.get_by_role("alert").get_by_text("Your session is over").wait_for()
     banner.wait_for(state="detached")
-    page.get_by_label("Key").fill(KEY)
+    page.get_by_label("Key", exact=True).fill(KEY)
     page.keyboard.press("Enter")
     page.get_by_text("The rig has no calibration that could be verified.").wait_for()
