@@ -115,7 +115,7 @@ def delete(
         pinned = [each for each in found.values() if each["pinned"]]
         if pinned:
             names = ", ".join(map(_called, pinned))
-            message = f"Nothing was deleted: {names} is kept for good. Let it go first: DELETE /scan/ID/pin."
+            message = f"Nothing was deleted: {names} is pinned. Unpin it first: DELETE /scan/ID/pin."
             raise ServiceError(message)
         if not yes:
             print_table(("id", "name", "created", "state", "", ""), [_row(each) for each in found.values()])

@@ -1,10 +1,11 @@
 // Models: scans of one object from several sides, shot on a turntable or by hand, or chosen, and the one mesh that is made of them.
 import {Downloads} from "./downloads.js";
 import {Live} from "./live.js";
+import {Keeping} from "./keeping.js";
 import {Mesh, loadDrawing} from "./mesh.js";
 import {NameHeading} from "./names.js";
 import {ask, follow, once, useAction, useValue} from "./service.js";
-import {Action, Choice, Confirm, Facts, Field, JobBadge, Progress, Refusal, count, length, moment, percent} from "./ui.js";
+import {Action, Choice, Facts, Field, JobBadge, Progress, Refusal, count, length, moment, percent} from "./ui.js";
 import {html, useEffect, useState} from "./vendor/preact-htm.js";
 
 const MODEL = "model.ply";
@@ -151,7 +152,7 @@ function Whole({model, rig, again, may}) {
       <section aria-label="Figures">
         <${Refusal} problem=${refused} />
         ${report && html`<${Figures} report=${report} path=${files["report.json"]} />`}
-        ${may("scan") && html`<${Keeping} model=${model} done=${done} again=${again} />`}
+        ${may("scan") && html`<h3>Keep or delete</h3><${Keeping} job=${model} kind="model" over=${done} again=${again} />`}
       </section>
     </div>
     ${files["sides.png"] && html`<h3>From six sides</h3><div class="wide"><img src=${files["sides.png"]} alt="The model from six sides" /></div>`}
@@ -250,16 +251,4 @@ function Pairs({report, views}) {
     <tbody>${report.pairs.map((pair) => html`<tr><th scope="row">${named.get(pair.first) ?? pair.first} and ${named.get(pair.second) ?? pair.second}</th><td>${percent(pair.overlap)}</td><td>${length(pair.rms_mm)}</td>
       <td>${pair.rms_over_sigma.toFixed(2)}</td><td>${length(pair.closure_mm)}</td></tr>`)}</tbody></table></div>
     <p class="quiet">The closure is how far a pair alone would put its views from where all together do.</p>`;
-}
-
-function Keeping({model, done, again}) {
-  const [sure, setSure] = useState(false);
-  const [cancel, cancelling, uncancelled] = useAction(() => ask("POST", model.links.cancel).then(again));
-  const [remove, , unremoved] = useAction(() => ask("DELETE", model.links.self).then(() => {
-    location.hash = "#/models";
-  }));
-  return html`<h3>Keep or delete</h3>
-    ${sure ? html`<${Confirm} question="Delete this model with all its files? Its scans stay." yes="Delete it" onYes=${remove} onNo=${() => setSure(false)} />`
-    : done ? html`<${Action} onClick=${() => setSure(true)}>Delete<//>` : html`<${Action} busy=${cancelling} onClick=${cancel}>Stop it<//>`}
-    <${Refusal} problem=${uncancelled ?? unremoved} />`;
 }

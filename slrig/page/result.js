@@ -1,11 +1,12 @@
 // A scan's result: its mesh, its figures, why pixels are missing, its files, and another scan beside it.
 import {Causes} from "./causes.js";
 import {Downloads} from "./downloads.js";
+import {Keeping} from "./keeping.js";
 import {limitToBox, limits} from "./limits.js";
 import {Mesh, loadDrawing} from "./mesh.js";
 import {NameHeading} from "./names.js";
 import {ask, follow, once, useAction, useValue} from "./service.js";
-import {Action, Confirm, Facts, JobBadge, Progress, Refusal, count, length, moment, percent} from "./ui.js";
+import {Action, Facts, JobBadge, Progress, Refusal, count, length, moment, percent} from "./ui.js";
 import {Panel, Workspace} from "./workspace.js";
 import {html, useEffect, useState} from "./vendor/preact-htm.js";
 
@@ -49,7 +50,7 @@ function Result({scan, again, may}) {
     ${report && Object.entries(report.cameras).map(([name, camera]) => html`<${Panel} key=${name} name=${`Camera ${name}`}>
       <${Causes} camera=${name} told=${camera} causes=${report.causes} files=${files} device=${calibration?.cameras[name] ?? null} pointed=${pointed} point=${point} /><//>`)}
     ${over && hasMesh && html`<${Panel} name="Compare"><${Compare} scan=${scan} chosen=${setOther} /><//>`}
-    <${Panel} name="Keep or delete"><${Keeping} scan=${scan} over=${over} again=${again} may=${may} /><//>`;
+    <${Panel} name="Keep or delete">${may("scan") && html`<${Keeping} job=${scan} kind="scan" over=${over} again=${again} />`}<//>`;
   if (hasMesh)
     return html`<${Mesh} key=${scan.id} scan=${scan} other=${other} report=${report} calibration=${calibration} again=${may("scan") ? limitToBox : null} over=${progress}
       pointed=${pointed} point=${point} head=${head}>${panels}<//>`;
@@ -123,23 +124,4 @@ function Compare({scan, chosen}) {
       <tbody>${rows.map(([name, mine, written, theirs]) => html`<tr><th scope="row">${name}</th><td>${mine === undefined ? "–" : written(mine)}</td>
         <td>${theirs === undefined ? "–" : written(theirs)}</td><td>${mine === undefined || theirs === undefined ? "–" : `${theirs < mine ? "−" : "+"}${written(Math.abs(theirs - mine))}`}</td></tr>`)}</tbody></table></div>
       <p class="quiet">Each is shown where its own calibration puts it. The colours "Deviation" show how far this mesh is from the other one.</p>`}`;
-}
-
-function Keeping({scan, over, again, may}) {
-  const [sure, setSure] = useState(false);
-  const [cancel, cancelling, uncancelled] = useAction(() => ask("POST", scan.links.cancel).then(again));
-  const [pin, pinning, unpinned] = useAction(() => ask(scan.pinned ? "DELETE" : "PUT", `${scan.links.self}/pin`).then(again));
-  const [remove, removing, unremoved] = useAction(() => ask("DELETE", scan.links.self).then(() => {
-    location.hash = "#/scan";
-  }));
-  const problem = uncancelled ?? unpinned ?? unremoved;
-  if (!may("scan")) return null;
-  return html`
-    ${sure ? html`<${Confirm} question="Delete this scan with all its files? Nothing brings it back." yes="Delete it" onYes=${remove} onNo=${() => setSure(false)} />`
-    : html`<div class="row">
-        ${!over && html`<${Action} busy=${cancelling} onClick=${cancel}>Stop it<//>`}
-        ${over && html`<${Action} busy=${pinning} aria-pressed=${scan.pinned} onClick=${pin}>${scan.pinned ? "Kept for good: let it go when old" : "Keep it for good"}<//>
-        <${Action} busy=${removing} onClick=${() => setSure(true)}>Delete<//>`}
-      </div>`}
-    <${Refusal} problem=${problem} />`;
 }
