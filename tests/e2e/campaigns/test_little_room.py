@@ -18,7 +18,7 @@ import pytest
 from slrig.errors import ServiceError
 from tests.e2e.campaigns.conftest import Stand
 from tests.e2e.campaigns.test_faults import marked
-from tests.e2e.campaigns.test_foreign_code import checks, is_ready, right_mesh
+from tests.e2e.campaigns.test_foreign_code import checks, faults, right_mesh
 from tests.e2e.conftest import scanned
 from tests.e2e.faulty_rig.service import Desk, half_written, serve
 from tests.e2e.schedules import awaited
@@ -32,7 +32,7 @@ GROUPS = Path("/sys/fs/cgroup/memory")
 
 
 def next_is_right(stand: Stand) -> None:
-    awaited(lambda: is_ready(stand), "readiness")
+    awaited(lambda: not faults(stand), "readiness")
     again = scanned(stand.client)
     assert again["state"] == "succeeded", again
     right_mesh(stand, again)
