@@ -11,12 +11,6 @@ from typing import Any, NamedTuple
 import pytest
 from filelock import FileLock
 
-from slrig.config import read_rig
-from slrig.discovery import open_rig
-from slrig.scan.acquisition import capture_frames
-from slrig.scan.plan import ScanPlan
-from tests.golden.test_bundles import reconstructed
-
 RIGS = Path(__file__).parents[2] / "config" / "rigs"
 
 
@@ -34,6 +28,13 @@ def scan_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scan]:
     root = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         root = root.parent
+
+    # Not above: the process that hands out tests loads this file first, and needs no mathematics.
+    from slrig.config import read_rig
+    from slrig.discovery import open_rig
+    from slrig.scan.acquisition import capture_frames
+    from slrig.scan.plan import ScanPlan
+    from tests.golden.test_bundles import reconstructed
 
     def made(name: str) -> Scan:
         folder = root / f"golden-{name}"
