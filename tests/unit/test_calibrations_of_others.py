@@ -24,6 +24,7 @@ from slrig.importers.coded_images import CodedImages
 from slrig.importers.lenses import MAX_FIT_PX, as_lens
 from slrig.model import Axis, Calibration, CameraFormat, FloatArray, Gray, Pattern, Pinhole, Size, to_gray
 from slrig.model.lens import distort
+from tests.core import parametrize_core
 from tests.strangers import harmed
 from tests.unit.calibrate_command import refused, run
 
@@ -144,7 +145,7 @@ def require_numbers(found: Calibration) -> None:
 
 
 @pytest.mark.parametrize("names", NAMES, ids=lambda names: names[0])
-@pytest.mark.parametrize("writer", WRITERS)
+@parametrize_core("writer", WRITERS, core=[0, 1])
 def test_the_same_arrays_under_any_names_from_any_library_are_read(
     tmp_path: Path, writer: str, names: tuple[str, ...]
 ) -> None:
@@ -324,7 +325,7 @@ OPEN: dict[str, Mapping[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("case", OPEN)
+@parametrize_core("case", OPEN, core=[0, 3])
 def test_columns_and_rows_decide_what_names_leave_open(tmp_path: Path, case: str) -> None:
     path = written(tmp_path / "rig.json", json.dumps(plain(OPEN[case])))
     found = import_calibration(path, **CAPTURE, capture=codes(*Axis))

@@ -127,6 +127,7 @@ def test_folder_of_poses_becomes_a_calibration(poses: Path, solving: Solving, tm
     assert stages[-2:] == ["adjustment", "done"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", [".yml", pytest.param(".xml", marks=pytest.mark.slow)])
 def test_solve_takes_all_its_options(poses: Path, solving: Solving, tmp_path: Path, ending: str) -> None:
     # As a service keeps them.
@@ -152,6 +153,7 @@ def test_solve_takes_all_its_options(poses: Path, solving: Solving, tmp_path: Pa
     assert (text.count("<img "), "Calibration from kept" in text) == (len(GIVEN), True)
 
 
+@pytest.mark.slow
 def test_folder_of_poses_is_checked_without_writing_anything(poses: Path, solving: Solving, tmp_path: Path) -> None:
     printed = done("check", poses, *BOARD_OPTIONS, "--board-shape", "flat")
     assert (solving.asked["poses"], solving.asked["board_shape"]) == (list(GIVEN), BoardShape.FLAT)
@@ -159,6 +161,7 @@ def test_folder_of_poses_is_checked_without_writing_anything(poses: Path, solvin
     assert [path.name for path in tmp_path.iterdir()] == ["poses"]
 
 
+@pytest.mark.slow
 def test_poses_that_cannot_be_used_are_named_and_left_out(poses: Path, solving: Solving, tmp_path: Path) -> None:
     (poses / "pose_01" / "bundle.json").write_text('{"format": "slrig-bundle", "vers')
     solving.known["pose_02"] = PoseRefusedError("pose 'pose_02': half a board: move it fully into view")
@@ -182,6 +185,7 @@ def test_board_that_no_pose_shows_is_named_once(poses: Path, solving: Solving, t
     assert not (tmp_path / "rig.json").exists()
 
 
+@pytest.mark.slow
 def test_refused_solve_names_the_poses_without_use(poses: Path, solving: Solving, tmp_path: Path) -> None:
     solving.refusal = SolveRefusedError("all boards are parallel: tilt them")
     (poses / "pose_03" / "bundle.json").write_text("{")

@@ -162,6 +162,7 @@ def test_end_that_the_disk_refuses_is_not_lost(bench: CalibrationBench, monkeypa
     assert record.coverage == {"poses": ["pose 1", "pose 2"]}
 
 
+@pytest.mark.slow
 def test_dropped_pose_is_in_no_solve_and_its_number_is_not_given_again(bench: CalibrationBench) -> None:
     session_id = bench.session()
     bench.shot(session_id)
@@ -196,6 +197,7 @@ def test_positioner_takes_a_pose_or_all_in_turn(moved: CalibrationBench) -> None
         moved.calibrations.shoot(session_id, PoseRequest(position=7), wait=False)
 
 
+@pytest.mark.slow
 def test_failed_or_cancelled_pose_ends_its_script(moved: CalibrationBench) -> None:
     session_id = moved.session()
     moved.began.clear()
@@ -213,6 +215,7 @@ def test_failed_or_cancelled_pose_ends_its_script(moved: CalibrationBench) -> No
     assert (record.script, record.latest_pose, moved.tame.visited) == ((), 2, [0, 0])
 
 
+@pytest.mark.slow
 def test_rig_without_a_positioner_says_so(bench: CalibrationBench) -> None:
     bench.until(bench.scan().id)
     poses = bench.calibrations
@@ -222,6 +225,7 @@ def test_rig_without_a_positioner_says_so(bench: CalibrationBench) -> None:
         poses.script(bench.session(), (), PoseRequest(), wait=False)
 
 
+@pytest.mark.slow
 def test_a_board_can_be_measured_when_its_poses_are_shot_and_once(bench: CalibrationBench) -> None:
     session_id = bench.session()
     bench.shot(session_id)
@@ -279,6 +283,7 @@ def used_focal_length(bench: CalibrationBench) -> tuple[str, float]:
     return used.solved.id, float(used.cameras["cam0"].matrix[0, 0])
 
 
+@pytest.mark.slow
 def test_second_solve_changes_no_calibration_in_use(bench: CalibrationBench) -> None:
     bench.tame.calibration = tame_calibration(focal_px=82.0)
     session_id = bench.solved()
@@ -325,7 +330,7 @@ def test_import_of_other_devices_is_not_activated_and_of_no_calibration_leaves_n
     assert bench.calibrations.active is None
 
 
-@pytest.mark.parametrize("name", ["calibration.json", "calibration.yml", "calibration.xml"])
+@pytest.mark.parametrize("name", ["calibration.json", pytest.param("calibration.yml", marks=pytest.mark.slow)])
 def test_exported_calibration_comes_in_again(bench: CalibrationBench, name: str) -> None:
     session_id = bench.solved()
     text = bench.calibrations.exported(session_id, name)
@@ -342,6 +347,7 @@ def test_exported_calibration_comes_in_again(bench: CalibrationBench, name: str)
     bench.calibrations.activate(record.id)
 
 
+@pytest.mark.slow
 def test_restart_keeps_the_active_one_and_marks_what_was_cut_off(bench: CalibrationBench) -> None:
     active = bench.solved()
     bench.calibrations.activate(active)
@@ -368,6 +374,7 @@ def test_restart_keeps_the_active_one_and_marks_what_was_cut_off(bench: Calibrat
     assert [each.observation.name for each in session_readings(again.store.folder(record.id))] == ["pose 1"]
 
 
+@pytest.mark.slow
 def test_pose_that_waited_is_shot_after_a_restart_and_one_with_its_frames_is_read(bench: CalibrationBench) -> None:
     session_id = bench.session()
     bench.shot(session_id)
@@ -390,6 +397,7 @@ def test_pose_that_waited_is_shot_after_a_restart_and_one_with_its_frames_is_rea
     assert bench.store.takes(waiting.id) == 1
 
 
+@pytest.mark.slow
 def test_poses_outlive_their_records_and_records_do_not_outlive_their_files(bench: CalibrationBench) -> None:
     session_id = bench.session()
     poses = [bench.shot(session_id) for _ in range(2)]
@@ -406,6 +414,7 @@ def test_poses_outlive_their_records_and_records_do_not_outlive_their_files(benc
     assert (lost.state, None if lost.fault is None else lost.fault.code) == (JobState.FAILED, "damaged")
 
 
+@pytest.mark.slow
 def test_links_are_not_followed_and_folders_of_no_session_put_aside(bench: CalibrationBench, tmp_path: Path) -> None:
     stray = bench.folder.calibrations / str(uuid4())
     stray.mkdir()
@@ -427,7 +436,9 @@ def test_links_are_not_followed_and_folders_of_no_session_put_aside(bench: Calib
     assert (elsewhere / "session.json").is_file()
 
 
-@pytest.mark.parametrize("damage", ["gone", "one digit", "pointer"])
+@pytest.mark.parametrize(
+    "damage", ["one digit", *(pytest.param(each, marks=pytest.mark.slow) for each in ("gone", "pointer"))]
+)
 def test_active_calibration_that_is_damaged_refuses_scans_until_another_is_chosen(
     bench: CalibrationBench, damage: str
 ) -> None:
@@ -469,6 +480,7 @@ def kept(bench: CalibrationBench, count: int | None, named: Callable[[], set[str
     return Retention(bench.folder.root, [(archive, Limits(count))], Audit(bench.store.database), clock)
 
 
+@pytest.mark.slow
 def test_only_what_is_neither_new_nor_needed_is_removed(bench: CalibrationBench) -> None:
     in_report, twice, in_bundle, active, empty, unused, begun, newest = (
         *(bench.solved() for _ in range(4)), bench.session(), bench.solved(), bench.session(), bench.solved(),
@@ -507,6 +519,7 @@ def test_a_pose_under_way_keeps_its_session(bench: CalibrationBench) -> None:
     assert kept(bench, 1).apply() == [old]
 
 
+@pytest.mark.slow
 def test_one_that_states_no_error_is_known_by_its_numbers(bench: CalibrationBench, tmp_path: Path) -> None:
     given = tmp_path / "given.json"
     needed, gone = (tame_calibration(focal_px=focal) for focal in (80.0, 90.0))

@@ -18,6 +18,7 @@ from slrig.calibration.poses.checks import LIMITS
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import PatternError, PoseRefusedError, TurntableRefusedError
 from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Size, White
+from tests.core import parametrize_core
 from tests.unit.calibrate.shot_boards import BOARD, Standing, both, patterns_for, position_at, shot, truth_of
 from tests.unit.scan.fakes import tame_calibration
 
@@ -95,6 +96,7 @@ def test_without_line_shift_code_edges_give_the_light() -> None:
         assert 0.8 <= ratio <= 1.25
 
 
+@pytest.mark.slow
 def test_without_inverses_a_pose_is_read_all_the_same(pose: Capture) -> None:
     found = read_captured(without_gray(pose, lambda pattern: pattern.inverted), BOARD, "bare")
     for rms_px, _, count in off_px(found.observation.correspondences["left"]).values():
@@ -102,6 +104,7 @@ def test_without_inverses_a_pose_is_read_all_the_same(pose: Capture) -> None:
         assert rms_px <= 0.02
 
 
+@pytest.mark.slow
 def test_bundle_reads_as_its_frames_do(pose: Capture, read: ReadPose, tmp_path: Path) -> None:
     write_bundle(tmp_path / "one", pose)
     again = read_pose(tmp_path / "one", BOARD, "pose 1")
@@ -112,6 +115,7 @@ def test_bundle_reads_as_its_frames_do(pose: Capture, read: ReadPose, tmp_path: 
     assert bundle_device_sizes(tmp_path / "one") == {"left": pose.cameras["left"].size, PROJECTOR: pose.projector}
 
 
+@pytest.mark.slow
 def test_white_alone_gives_corners_and_no_light(pose: Capture, tmp_path: Path) -> None:
     alone = without(pose, Black, Gray, LineShift)
     found = read_captured(alone, BOARD, "cameras")
@@ -127,6 +131,7 @@ def test_white_alone_gives_corners_and_no_light(pose: Capture, tmp_path: Path) -
     assert np.isnan(read_captured(white_only, BOARD, "one frame").figures["left"].moved_px)
 
 
+@pytest.mark.slow
 def test_camera_that_does_not_see_the_board_leaves_the_other(pose: Capture) -> None:
     blind = both(without(pose, Gray, LineShift), shot(Standing(away=True), patterns=ENDS, camera="right"))
     found = read_captured(blind, BOARD, "half")
@@ -140,6 +145,7 @@ def moved_px_of(shift_mm: tuple[float, float, float], seed: int = 1) -> float:
     return read_captured(seen, BOARD, "moving").figures["left"].moved_px
 
 
+@pytest.mark.slow
 def test_board_that_stands_still_does_not_move() -> None:
     # Chance makes one of ten thousand poses move.
     assert [moved_px_of((0.0, 0.0, 0.0), seed) for seed in range(4)] == [0.0] * 4
@@ -148,7 +154,7 @@ def test_board_that_stands_still_does_not_move() -> None:
 @pytest.mark.parametrize(
     ("shift_mm", "warned"),
     [
-        ((0.03, 0.0, 0.0), False),
+        pytest.param((0.03, 0.0, 0.0), False, marks=pytest.mark.slow),
         ((0.0, 0.06, 0.0), True),
         pytest.param((0.0, 0.0, 0.15), False, marks=pytest.mark.slow),
         pytest.param((3.0, 0.0, 0.0), True, marks=pytest.mark.slow),
@@ -175,6 +181,7 @@ def test_board_moved_by_two_squares_does_not_look_as_if_it_stood_still() -> None
     assert moved_px(frames, view, BOARD, region, 255.0) == pytest.approx(36.0 * 570 / 605, rel=0.1)
 
 
+@pytest.mark.slow
 def test_jolt_between_two_white_frames_shows_where_inverses_were_played(pose: Capture) -> None:
     half = len(pose.shots) // 2
     steps = slice(half - 8, half + 8)
@@ -201,7 +208,7 @@ def moved_far(_: Capture) -> Capture:
     return shot(standing, then=standing.shifted((40.0, 25.0, 0.0)), patterns=(*ENDS, *ENDS))
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("spoilt", "words"),
     [
         (lambda _: shot(Standing(away=True), patterns=ENDS), r"pose 'bad': no camera sees the board.*camera 'left'"),
@@ -213,17 +220,20 @@ def moved_far(_: Capture) -> Capture:
         (bracket, "one exposure"),
         (unlit, r"codes cannot be read.*projector lights 0%.*projector's picture"),
     ],
+    core=[0, 1, 7],
 )
 def test_bad_pose_is_refused_with_its_cause(pose: Capture, spoilt: Callable[[Capture], Capture], words: str) -> None:
     with pytest.raises((PoseRefusedError, PatternError), match=words):
         read_captured(spoilt(pose), BOARD, "bad")
 
 
+@pytest.mark.slow
 def test_another_board_is_refused(pose: Capture) -> None:
     with pytest.raises(PoseRefusedError, match="camera 'left'"):
         read_captured(pose, Board(BoardKind.CHESSBOARD, 6, 9, 18.0), "wrong")
 
 
+@pytest.mark.slow
 def test_clipped_paper_is_counted(pose: Capture) -> None:
     ends = without(pose, Gray, LineShift)
     bright = [replace(each, image=np.minimum(each.image.astype(int) * 2, 255).astype(np.uint8)) for each in ends.shots]

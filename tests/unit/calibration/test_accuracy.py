@@ -169,6 +169,7 @@ def held_at_its_distance(camera: Pinhole, pixels_px: FloatArray, places: FloatAr
     return np.asarray(camera.centre_mm + far[:, None] * directions)
 
 
+@pytest.mark.slow
 def test_the_error_of_one_camera_alone_is_across_its_rays() -> None:
     camera = left_camera()
     solution, observations = solved({"left": camera}, None)
@@ -298,6 +299,7 @@ def covariance() -> FloatArray:
     return covariance_by_known_points([left_camera(), light_source()], 1, 0.05, 1)
 
 
+@pytest.mark.slow
 def test_halves_that_are_off_as_they_state_differ_by_what_is_stated() -> None:
     spread = covariance()
     off = draws(spread, 500, 5)

@@ -149,6 +149,7 @@ def make_capture(*shots: Shot) -> Capture:
     return Capture(PROJECTOR, PATTERNS, {"left": Scene().format}, shots)
 
 
+@pytest.mark.slow
 def test_a_recorded_bracket_is_checked_by_exposures() -> None:
     sound = make_capture(*shots_at(0.25), *shots_at(1.0), *shots_at(1.6))
     found = check_exposures(sound)

@@ -187,6 +187,7 @@ def test_light_that_changes_is_no_fault(factor: Factor, is_exposure: bool, patte
         assert found.verified == len(patterns)
 
 
+@pytest.mark.slow
 def test_the_light_of_each_kind_of_pattern_is_reported() -> None:
     light = summary(LINES, shots(LINES, follows_picture)).light["left"]
     assert light["column Gray code"].median == pytest.approx(1.33, rel=0.03)

@@ -13,6 +13,7 @@ import pytest
 from slrig.capture.frame_order import describe_indices, find_code_fault, find_order_fault, relate_frames
 from slrig.capture.verifier import EvidenceSummary, Sampler, check_capture
 from slrig.model import Axis, Black, Capture, Gray, Pattern, Pixels, Shot, Size, White, to_gray
+from tests.core import parametrize_core
 from tests.unit.capture.fake_rig import PROJECTOR, Scene, patterns_for
 from tests.unit.capture.test_evidence import SCENES
 
@@ -52,7 +53,7 @@ def shifted(by: int) -> list[Pixels]:
     return [images()[(index + by) % len(CODE)] for index in range(len(CODE))]
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("frames", "words"),
     [
         (shifted(1), "all frames are one frame ahead of their patterns: with the last frame moved to the front"),
@@ -65,6 +66,7 @@ def shifted(by: int) -> list[Pixels]:
         ([255 - image for image in images()], "all frames show the inverse of their patterns"),
     ],
     ids=["one ahead", "one behind", "two ahead", "five behind", "one missing", "one twice", "white, black", "inverted"],
+    core=[0, 3, 6],
 )
 def test_a_sequence_in_another_order_is_named_and_of_no_use(frames: Sequence[Pixels], words: str) -> None:
     found = summary(frames)
@@ -169,6 +171,7 @@ def test_frames_are_listed_in_ranges() -> None:
     assert describe_indices([0, 1]) == "0, 1"
 
 
+@pytest.mark.slow
 def test_a_camera_that_sees_a_part_of_the_projector_needs_no_explanation() -> None:
     size = Size(1024, 96)
     for first_px in (2.0, 300.0, 880.0):

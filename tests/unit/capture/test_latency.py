@@ -32,6 +32,7 @@ from slrig.devices import CameraSettings, DisplayedPattern, Rig, Synchronisation
 from slrig.discovery import open_rig
 from slrig.errors import ConfigError, ScanEvidenceError, UnsupportedByDeviceError
 from slrig.model import FloatArray, Pixels
+from tests.core import parametrize_core
 from tests.unit.simulated_rig.building import small_head
 
 
@@ -279,7 +280,7 @@ def both_ways(light: Light) -> Callable[[bool, np.random.Generator], Light]:
 # ---- the fit
 
 
-@pytest.mark.parametrize(("latency_s", "line_s"), [(0.012, 0.0), (-0.004, 1.5e-5), (0.012, 6e-5), (-0.004, 3e-4)])
+@parametrize_core(("latency_s", "line_s"), [(0.012, 0.0), (-0.004, 1.5e-5), (0.012, 6e-5), (-0.004, 3e-4)], core=[1, 2])
 def test_latency_and_line_time_come_out_of_the_rows(latency_s: float, line_s: float) -> None:
     found = World(both_ways(step(latency_s)), line_s=line_s, period_s=0.032).measured()
     assert found.latency_s == pytest.approx(latency_s, abs=1e-4)
@@ -324,7 +325,7 @@ def test_light_that_waits_for_the_refresh_is_measured_as_jitter() -> None:
     assert found.latest_s == pytest.approx(0.004 + period_s + 0.6e-3, abs=1e-3)
 
 
-@pytest.mark.parametrize("jitter_s", [0.0, 0.016])
+@parametrize_core("jitter_s", [0.0, 0.016], core=[1])
 def test_a_picture_that_missed_its_refresh_does_not_widen_the_window(jitter_s: float) -> None:
     def world(*missed: int) -> World:
         shown = count()
@@ -350,6 +351,7 @@ def test_a_picture_that_missed_its_refresh_does_not_widen_the_window(jitter_s: f
     assert often.latest_s > 0.037
 
 
+@pytest.mark.slow
 def test_a_flash_that_came_late_asks_for_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usual = rig(tmp_path, faults={"light_delay_s": 0.012})
     fit = fit_latency
@@ -373,8 +375,8 @@ def halfway(at_s: float, length_s: float, level: float) -> Callable[[bool, np.ra
     return light
 
 
-@pytest.mark.parametrize("line_s", [0.0, 1e-4])
-@pytest.mark.parametrize(
+@parametrize_core("line_s", [0.0, 1e-4], core=[1])
+@parametrize_core(
     ("light", "length_s"),
     [
         (halfway(0.01, 1 / 60, 0.5), 1 / 60),
@@ -384,6 +386,7 @@ def halfway(at_s: float, length_s: float, level: float) -> Callable[[bool, np.ra
         (lambda to_white, rng: both_ways(step(0.004 + float(rng.uniform(0, 1 / 60))))(to_white, rng), 0.0),
         (lambda to_white, rng: both_ways(step(0.004 + float(rng.normal(0, 0.004))))(to_white, rng), 0.0),
     ],
+    core=[0, 3, 4],
 )
 def test_a_picture_between_white_and_black_is_seen(
     light: Callable[[bool, np.random.Generator], Light], length_s: float, line_s: float
@@ -405,6 +408,7 @@ def test_slower_darkening_than_brightening_is_measured_and_waited_for() -> None:
     assert found.latest_s == pytest.approx(0.015, abs=3e-4)
 
 
+@pytest.mark.slow
 def test_a_colour_wheel_is_flicker_and_hardly_changes_the_latency() -> None:
     # Three colours of unlike brightness, each lit for a third of a turn, 120 turns a second, not in step with show.
     turn_s, colours = 1 / 120, np.array([1.5, 1.0, 0.5])

@@ -28,9 +28,7 @@ def wired(readout_s: float | None) -> FakeRig:
     )
 
 
-@pytest.mark.parametrize(
-    ("readout_s", "least_s"), [(None, TOLD_S), (0.0044, 0.0144), (0.0115, 0.0215), (0.014, 0.024), (0.0244, 0.0344)]
-)
+@pytest.mark.parametrize(("readout_s", "least_s"), [(None, TOLD_S), (0.0115, 0.0215)])
 def test_the_least_period_is_found_by_a_few_plays(readout_s: float | None, least_s: float) -> None:
     fake = wired(readout_s)
     asked_s, found_s = measure_trigger_period(fake.rig, SEQUENCE)

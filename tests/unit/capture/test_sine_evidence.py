@@ -146,6 +146,7 @@ def test_a_period_that_runs_backwards_contradicts_the_other() -> None:
     assert re.search(r"run opposite|exchanged", fault)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("one", "other"), [pytest.param(2, 3, marks=pytest.mark.slow), (2, 4)])
 def test_exchanged_frames_that_fit_other_positions_are_found_by_their_jumps(one: int, other: int) -> None:
     patterns = SEQUENCES["micro"]

@@ -28,6 +28,7 @@ from slrig.calibration.detection.detection import (
 )
 from slrig.calibration.detection.lattice import equivalent_numberings
 from slrig.errors import PoseRefusedError
+from tests.core import parametrize_core
 from tests.unit.calibration.painted import PaintedCamera, PrintStyle, as_8_bit, board_points, camera_at, paint
 
 CHARUCO = Board(BoardKind.CHARUCO, 7, 5, 14.0)
@@ -40,11 +41,6 @@ KINDS = [(CHARUCO, PrintStyle()), (CHESSBOARD, PrintStyle()), (CIRCLES, PrintSty
 LENS = (-0.12, 0.06, 0.001, -0.001, 0.0)
 FINE: dict[str, Any] = {"width": 640, "height": 512, "focal_px": 800.0}
 NOISE = 0.01
-
-
-def slow(*values: object) -> Any:
-    """One more case, for the long run."""
-    return pytest.param(*values, marks=pytest.mark.slow)
 
 
 def title(given: object) -> str:
@@ -82,15 +78,16 @@ def corner_errors(view: BoardView, board: Board, camera: PaintedCamera) -> NDArr
     return view.points_px - camera.project(board_points(board)[view.corner])
 
 
-@pytest.mark.parametrize(("board", "style"), [slow(*KINDS[0]), *KINDS[1:]], ids=title)
-@pytest.mark.parametrize(
+@parametrize_core(("board", "style"), KINDS, core=[1], ids=title)
+@parametrize_core(
     ("tilt_deg", "blur_px", "noise", "most_rms_px"),
     [
-        slow((0.0, 0.0), 0.6, 0.0, 0.007),
-        slow((0.0, 0.0), 1.0, 0.01, 0.015),
+        ((0.0, 0.0), 0.6, 0.0, 0.007),
+        ((0.0, 0.0), 1.0, 0.01, 0.015),
         ((30.0, -35.0), 0.7, 0.01, 0.02),
-        slow((-30.0, 20.0), 1.5, 0.03, 0.07),
+        ((-30.0, 20.0), 1.5, 0.03, 0.07),
     ],
+    core=[2],
 )
 def test_corners_are_accurate_within_their_stated_deviation(
     board: Board, style: PrintStyle, tilt_deg: tuple[float, float], blur_px: float, noise: float, most_rms_px: float
@@ -120,16 +117,17 @@ def test_circles_of_any_radius_are_found(radius: float) -> None:
     assert np.sqrt((corner_errors(view, CIRCLES, camera) ** 2).mean()) < 0.02
 
 
-@pytest.mark.parametrize("roll_deg", [slow(107.0), 184.0])
-@pytest.mark.parametrize(("board", "style"), [slow(*KINDS[0]), *KINDS[1:3], slow(*KINDS[3])], ids=title)
+@parametrize_core("roll_deg", [184.0, 107.0])
+@parametrize_core(("board", "style"), KINDS, core=[1], ids=title)
 def test_a_board_with_one_numbering_keeps_it_at_any_angle(board: Board, style: PrintStyle, roll_deg: float) -> None:
     camera = board_camera(board, roll_deg=roll_deg)
     view = find_board(shoot(board, camera, style=style), board, full_scale=255)
     assert np.abs(corner_errors(view, board, camera)).max() < 0.1
 
 
-@pytest.mark.parametrize("roll_deg", [slow(10.0), 190.0])
-@pytest.mark.parametrize("board", [Board(BoardKind.CHESSBOARD, 7, 5, 14.0), slow(EVEN_CIRCLES)], ids=title)
+@pytest.mark.slow
+@pytest.mark.parametrize("roll_deg", [10.0, 190.0])
+@pytest.mark.parametrize("board", [Board(BoardKind.CHESSBOARD, 7, 5, 14.0), EVEN_CIRCLES], ids=title)
 def test_equivalent_numberings_include_the_true_one(board: Board, roll_deg: float) -> None:
     camera = board_camera(board, roll_deg=roll_deg)
     view = find_board(shoot(board, camera), board, full_scale=255)
@@ -140,7 +138,8 @@ def test_equivalent_numberings_include_the_true_one(board: Board, roll_deg: floa
     assert (grid[:, -1] - grid[:, 0]).mean(axis=0)[0] > 0
 
 
-@pytest.mark.parametrize("full_scale", [1023.0, slow(1.0)])
+@pytest.mark.slow
+@pytest.mark.parametrize("full_scale", [1023.0, 1.0])
 def test_any_depth_of_image_gives_the_same_corners(full_scale: float) -> None:
     image = paint(CHESSBOARD, board_camera(CHESSBOARD), samples=3)
     kind = np.float32 if full_scale == 1.0 else np.uint16
@@ -149,6 +148,7 @@ def test_any_depth_of_image_gives_the_same_corners(full_scale: float) -> None:
     assert np.abs(view.points_px - reference.points_px).max() < 0.02
 
 
+@pytest.mark.slow
 def test_corners_of_a_dim_image_state_larger_deviations() -> None:
     bright = find_board(shoot(CHARUCO, noise=0.002), CHARUCO, full_scale=255)
     dim = paint(CHARUCO, board_camera(CHARUCO), samples=4) * 0.08
@@ -156,7 +156,7 @@ def test_corners_of_a_dim_image_state_larger_deviations() -> None:
     assert np.median(dim_view.sigma_px) > 2 * np.median(bright.sigma_px)
 
 
-@pytest.mark.parametrize("style", [PrintStyle(), OLD], ids=title)
+@parametrize_core("style", [PrintStyle(), OLD], ids=title)
 def test_a_part_of_a_charuco_board_is_enough(style: PrintStyle) -> None:
     camera = board_camera(CHARUCO, shift_mm=(45.0, 20.0))
     view = find_board(shoot(CHARUCO, camera, style=style), CHARUCO, full_scale=255)
@@ -168,7 +168,7 @@ def test_a_part_of_a_charuco_board_is_enough(style: PrintStyle) -> None:
     assert set(np.flatnonzero(within)) - set(view.corner.tolist()) == set()
 
 
-@pytest.mark.parametrize(("board", "style"), [(CHARUCO, OLD), *(slow(*each) for each in KINDS[:3])], ids=title)
+@parametrize_core(("board", "style"), KINDS, core=[3], ids=title)
 def test_corners_are_refined_after_a_small_movement(board: Board, style: PrintStyle) -> None:
     before, after = board_camera(board), board_camera(board, shift_mm=(0.1, -0.05))
     view = find_board(shoot(board, before, style=style), board, full_scale=255)
@@ -204,7 +204,7 @@ def assert_refused(image: NDArray[np.uint8], board: Board, message: str) -> None
         find_board(image, board, full_scale=255)
 
 
-@pytest.mark.parametrize("board", [CHARUCO, slow(CHESSBOARD), slow(CIRCLES)], ids=title)
+@parametrize_core("board", ALL, ids=title)
 def test_nothing_in_view_is_refused_with_the_likely_cause(board: Board) -> None:
     random = np.random.default_rng(3)
     assert_refused(as_8_bit(random.normal(0.4, 0.02, (320, 400))), board, "not in view")
@@ -213,40 +213,39 @@ def test_nothing_in_view_is_refused_with_the_likely_cause(board: Board) -> None:
     assert_refused(as_8_bit(20 * paint(board, board_camera(board), samples=1)), board, "clipped to white")
 
 
-@pytest.mark.parametrize(("board", "blur_px"), [(CHARUCO, 9.0), slow(CHESSBOARD, 11.0)], ids=title)
+@parametrize_core(("board", "blur_px"), [(CHARUCO, 9.0), (CHESSBOARD, 11.0)], ids=title)
 def test_a_board_out_of_focus_is_refused(board: Board, blur_px: float) -> None:
     camera = board_camera(board, **FINE) if board is CHESSBOARD else board_camera(board)
     assert_refused(shoot(board, camera, blur_px=blur_px, samples=2), board, "out of focus")
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("expected", "present", "message"),
     [
-        slow(CHESSBOARD, Board(BoardKind.CHESSBOARD, 10, 7, 11.0), "another board.*found a chessboard of 10 x 7"),
-        slow(CHESSBOARD, Board(BoardKind.CHESSBOARD, 10, 5, 11.0), "another board.*found a chessboard of 10 x 5"),
-        slow(CHESSBOARD, Board(BoardKind.CHESSBOARD, 6, 4, 16.0), "another board.*found a chessboard of 6 x 4"),
-        slow(CHESSBOARD, Board(BoardKind.CHESSBOARD, 7, 6, 14.0), "another board.*found a chessboard of 7 x 6"),
-        slow(CHESSBOARD, Board(BoardKind.CHARUCO, 8, 5, 14.0), "another board.*ChArUco.*DICT_5X5"),
-        slow(CHESSBOARD, CIRCLES, "another board.*circles"),
-        slow(CHARUCO, CHESSBOARD, "another board.*chessboard of 8 x 5"),
-        slow(CHARUCO, CIRCLES, "another board.*circles"),
+        (CHESSBOARD, Board(BoardKind.CHESSBOARD, 10, 7, 11.0), "another board.*found a chessboard of 10 x 7"),
+        (CHESSBOARD, Board(BoardKind.CHESSBOARD, 10, 5, 11.0), "another board.*found a chessboard of 10 x 5"),
+        (CHESSBOARD, Board(BoardKind.CHESSBOARD, 6, 4, 16.0), "another board.*found a chessboard of 6 x 4"),
+        (CHESSBOARD, Board(BoardKind.CHESSBOARD, 7, 6, 14.0), "another board.*found a chessboard of 7 x 6"),
+        (CHESSBOARD, Board(BoardKind.CHARUCO, 8, 5, 14.0), "another board.*ChArUco.*DICT_5X5"),
+        (CHESSBOARD, CIRCLES, "another board.*circles"),
+        (CHARUCO, CHESSBOARD, "another board.*chessboard of 8 x 5"),
+        (CHARUCO, CIRCLES, "another board.*circles"),
         (CHARUCO, Board(BoardKind.CHARUCO, 7, 5, 14.0, dictionary="DICT_4X4_100"), "another board.*DICT_4X4"),
-        slow(CHARUCO, Board(BoardKind.CHARUCO, 9, 6, 12.0), "another board.*marker .* is in view.*9 corners in a row"),
+        (CHARUCO, Board(BoardKind.CHARUCO, 9, 6, 12.0), "another board.*marker .* is in view.*9 corners in a row"),
         (CHARUCO, Board(BoardKind.CHARUCO, 5, 4, 16.0), "another board.*are not in the order.*5 corners in a row"),
-        slow(
-            CHARUCO, Board(BoardKind.CHARUCO, 7, 5, 14.0, marker_mm=7.7), "another board.*of a square wide.*found 0.5"
-        ),
-        slow(CIRCLES, Board(BoardKind.CIRCLES, 4, 9, 9.0), "another board.*7 rows of 4"),
-        slow(CIRCLES, Board(BoardKind.CIRCLES, 5, 7, 9.0), "another board.*7 rows of 4"),
-        slow(CIRCLES, CHESSBOARD, "another board.*chessboard of 8 x 5"),
+        (CHARUCO, Board(BoardKind.CHARUCO, 7, 5, 14.0, marker_mm=7.7), "another board.*of a square wide.*found 0.5"),
+        (CIRCLES, Board(BoardKind.CIRCLES, 4, 9, 9.0), "another board.*7 rows of 4"),
+        (CIRCLES, Board(BoardKind.CIRCLES, 5, 7, 9.0), "another board.*7 rows of 4"),
+        (CIRCLES, CHESSBOARD, "another board.*chessboard of 8 x 5"),
     ],
+    core=[8],
     ids=title,
 )
 def test_another_board_is_refused_with_its_description(expected: Board, present: Board, message: str) -> None:
     assert_refused(shoot(present, board_camera(present, **FINE)), expected, message)
 
 
-@pytest.mark.parametrize(("count", "message"), [(15, "another board.*found 15 of DICT_4X4"), slow(8, "not in view")])
+@parametrize_core(("count", "message"), [(15, "another board.*found 15 of DICT_4X4"), (8, "not in view")])
 def test_a_dozen_unordered_markers_are_named(count: int, message: str) -> None:
     """Single markers are read into anything."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
@@ -257,7 +256,7 @@ def test_a_dozen_unordered_markers_are_named(count: int, message: str) -> None:
     assert_refused(image, CHARUCO, message)
 
 
-@pytest.mark.parametrize("present", [CHARUCO, slow(CIRCLES)], ids=title)
+@parametrize_core("present", [CHARUCO, CIRCLES], ids=title)
 def test_swapped_corner_counts_are_named(present: Board) -> None:
     expected = Board(present.kind, present.rows, present.columns, present.square_mm)
     message = f"another board.*swap them, corners .--corners. {present.columns}x{present.rows}"
@@ -279,7 +278,7 @@ def test_a_chessboard_is_found_with_swapped_corner_counts() -> None:
     assert across[0] * down[1] - across[1] * down[0] == 1
 
 
-@pytest.mark.parametrize("board", [CHARUCO, slow(EVEN_CIRCLES)], ids=title)
+@parametrize_core("board", [CHARUCO, EVEN_CIRCLES], ids=title)
 def test_a_mirrored_print_is_refused(board: Board) -> None:
     assert_refused(shoot(board, style=PrintStyle(mirrored=True)), board, "mirrored print.*without mirroring")
 
@@ -296,14 +295,15 @@ def test_a_symmetric_print_is_found_mirrored(board: Board) -> None:
     assert apart.max() < 0.1
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("board", "shift_mm", "side"),
     [
-        slow(CHESSBOARD, (55.0, 0.0), "right"),
-        slow(CHESSBOARD, (0.0, -45.0), "upper"),
-        slow(CIRCLES, (55.0, 0.0), "right"),
+        (CHESSBOARD, (55.0, 0.0), "right"),
+        (CHESSBOARD, (0.0, -45.0), "upper"),
+        (CIRCLES, (55.0, 0.0), "right"),
         (CIRCLES, (0.0, 55.0), "lower"),
     ],
+    core=[3],
     ids=title,
 )
 def test_half_a_board_is_refused_with_the_clipped_side(board: Board, shift_mm: tuple[float, float], side: str) -> None:
@@ -364,7 +364,7 @@ def test_too_little_of_a_charuco_board_is_refused() -> None:
     assert_refused(image, CHARUCO, "too little of the charuco")
 
 
-@pytest.mark.parametrize("style", [slow(PrintStyle()), OLD], ids=title)
+@parametrize_core("style", [OLD, PrintStyle()], ids=title)
 def test_markers_that_fit_both_layouts_are_refused(style: PrintStyle) -> None:
     """All markers but those of one row are covered: a step of one square aside they are the other layout's."""
     straight = camera_at(CHARUCO, distance_mm=205.0)
@@ -374,7 +374,8 @@ def test_markers_that_fit_both_layouts_are_refused(style: PrintStyle) -> None:
     assert_refused(image, CHARUCO, "too little of the charuco")
 
 
-@pytest.mark.parametrize(("board", "style"), [*(slow(*each) for each in KINDS[:3]), KINDS[3]], ids=title)
+@pytest.mark.slow
+@pytest.mark.parametrize(("board", "style"), KINDS, ids=title)
 def test_masks_follow_the_print(board: Board, style: PrintStyle) -> None:
     camera = board_camera(board, **FINE)
     size = (camera.height, camera.width)
@@ -396,8 +397,8 @@ def test_masks_follow_the_print(board: Board, style: PrintStyle) -> None:
     assert light[region].mean() == pytest.approx(share, abs=0.05)
 
 
-@pytest.mark.parametrize(("board", "style"), [slow(*KINDS[0]), KINDS[1], slow(*KINDS[2]), KINDS[3]], ids=title)
-@pytest.mark.parametrize("blur_px", [slow(0.7), 1.3])
+@parametrize_core(("board", "style"), KINDS, core=[1], ids=title)
+@parametrize_core("blur_px", [1.3, 0.7])
 def test_the_blur_is_measured(board: Board, style: PrintStyle, blur_px: float) -> None:
     image = shoot(board, board_camera(board, distance_mm=170.0, tilt_deg=(5.0, 5.0)), blur_px=blur_px, style=style)
     view = find_board(image, board, full_scale=255)

@@ -7,7 +7,6 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +25,7 @@ from slrig.calibration.health.verification import verify_by_board
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, Pinhole, SolveRecord
+from tests.core import parametrize_core
 from tests.unit.calibration.health.drifting import (
     BOARD,
     Bench,
@@ -37,11 +37,6 @@ from tests.unit.calibration.health.drifting import (
     turned,
     zoomed,
 )
-
-
-def slow(*values: object) -> Any:
-    """One more case, for the long run."""
-    return pytest.param(*values, marks=pytest.mark.slow)
 
 
 def planted(devices: Mapping[str, Pinhole], change: str) -> Mapping[str, Pinhole]:
@@ -69,13 +64,13 @@ def looked(rig: Bench, devices: Mapping[str, Pinhole], seed: int = 0) -> Verific
     return verify_by_board([look_of(devices, seed)], BOARD, rig.calibration)
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("change", "device", "kind", "words"),
     [
         ("camera turned aside", "left", Change.TURNED, "camera 'left' turned by 0.0"),
-        slow("projector turned aside", PROJECTOR, Change.TURNED, "the projector turned by 0.0"),
-        slow("camera focal", "left", Change.FOCAL, "camera 'left': its focal length changed by +0.0"),
-        slow("projector focal", PROJECTOR, Change.FOCAL, "the projector: its focal length changed by +0.0"),
+        ("projector turned aside", PROJECTOR, Change.TURNED, "the projector turned by 0.0"),
+        ("camera focal", "left", Change.FOCAL, "camera 'left': its focal length changed by +0.0"),
+        ("projector focal", PROJECTOR, Change.FOCAL, "the projector: its focal length changed by +0.0"),
     ],
 )
 def test_a_change_makes_stale_is_named_and_predicts_its_error(
@@ -93,7 +88,8 @@ def test_a_change_makes_stale_is_named_and_predicts_its_error(
     assert found.expected_mm == pytest.approx(true_error_mm(now, rig.calibration), rel=0.3)
 
 
-@pytest.mark.parametrize("change", [slow("camera turned up"), slow("projector turned up"), "baseline"])
+@pytest.mark.slow
+@pytest.mark.parametrize("change", ["camera turned up", "projector turned up", "baseline"])
 def test_changes_that_the_geometry_cannot_distinguish_are_named_together(change: str) -> None:
     # A turn about the line between both devices is the same turn of the other, backwards; one that moved is the other
     # one moved the opposite way, or a board of another size.
@@ -197,6 +193,7 @@ def test_a_rig_of_other_cameras_is_refused_with_words() -> None:
         verify_by_board([look_of(rig.devices, 0)], BOARD, other)
 
 
+@pytest.mark.slow
 def test_a_calibration_that_says_nothing_of_its_error_is_judged_by_the_residuals() -> None:
     rig = bench()
     bare = Calibration({"left": rig.devices["left"]}, rig.devices[PROJECTOR])

@@ -494,6 +494,7 @@ def _cell(picture: np.ndarray[tuple[int, ...], np.dtype[np.uint8]], row: int, co
     return [int(each) for each in colours[counts.argmax()]]
 
 
+@pytest.mark.slow
 def test_a_coverage_picture_fills_covered_cells_and_draws_the_outline() -> None:
     shooting = rig_of()
     tilts = ((0.0, 0.0), (20.0, 0.0))
