@@ -22,7 +22,7 @@ boards = some.builds(
 )
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(board=boards, page=some.sampled_from([*PAGES_MM, FIT]))
 def test_all_that_is_printed_lies_on_the_page_or_the_largest_square_is_told(board: Board, page: str) -> None:
     try:

@@ -17,7 +17,7 @@ from slrig.model import FloatArray, IntArray
 from tests.unit.meshing.plain import boundary_edges, grid_faces
 
 # The first call of a kernel compiles it.
-unhurried = settings(deadline=None, max_examples=40)
+unhurried = settings(deadline=None, max_examples=15)
 seeds = st.integers(0, 2**32 - 1)
 
 

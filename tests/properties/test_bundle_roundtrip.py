@@ -114,7 +114,7 @@ def _solved_calibrations(draw: st.DrawFn) -> Calibration:
     return replace(calibration, solved=solved)
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(_captures())
 def test_a_bundle_comes_back_as_it_was_written(capture: Capture) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -159,7 +159,7 @@ def _same(got: Calibration, want: Calibration) -> None:
             np.testing.assert_array_equal(left, right)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(calibrations | _solved_calibrations(), st.sampled_from(["json", "yml", "yaml", "xml"]))
 def test_a_calibration_comes_back_bit_by_bit(calibration: Calibration, ending: str) -> None:
     with tempfile.TemporaryDirectory() as folder:

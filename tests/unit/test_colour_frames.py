@@ -157,6 +157,7 @@ def coloured_rig(**faults: Any) -> FakeRig:
     return fake
 
 
+@pytest.mark.slow
 def test_a_scan_keeps_colour_of_white_and_black_where_a_camera_has_it_and_makes_no_other(tmp_path: Path) -> None:
     captured(fake := coloured_rig(), tmp_path / "bundle", sink := Sink())
     capture = read_bundle(tmp_path / "bundle").capture
@@ -168,6 +169,7 @@ def test_a_scan_keeps_colour_of_white_and_black_where_a_camera_has_it_and_makes_
                 np.testing.assert_array_equal(shot.colour[..., 1], shot.image)
 
 
+@pytest.mark.slow
 def test_colour_of_a_refused_frame_is_not_kept(tmp_path: Path) -> None:
     captured(coloured_rig(garbled=frozenset({0})), tmp_path / "bundle")
     assert [path.name for path in (tmp_path / "bundle" / "refused").glob("*colour*")] == []

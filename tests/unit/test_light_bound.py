@@ -85,6 +85,7 @@ def test_white_noise_gives_the_closed_form_of_a_gaussian_stripe() -> None:
     assert np.median(bound.snr) == pytest.approx(height_e(exposed) / 3000.0, rel=0.01)
 
 
+@pytest.mark.slow
 def test_an_estimator_on_the_sensor_s_own_frames_attains_the_bound_and_none_beats_it() -> None:
     sensor = {"full_well_e": 20000.0, "bit_depth": 10, "saturation_s": 1.0, "read_noise_e": 12.0, "pedestal_dn": 30.0}
     exposed, ahead, behind = (
@@ -113,6 +114,7 @@ def test_an_estimator_on_the_sensor_s_own_frames_attains_the_bound_and_none_beat
     assert np.sqrt(np.mean((np.std(plain, axis=1) / bound.row_known_px[kept]) ** 2)) > 1.03
 
 
+@pytest.mark.slow
 def test_crossings_are_where_the_true_map_says_and_stripes_at_the_border_are_left_out() -> None:
     exposed = exposed_view(WHITE_NOISE, phase_px=0.3)
     bound = bound_of(exposed)

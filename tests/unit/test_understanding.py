@@ -13,6 +13,7 @@ from slrig.importers.detection import sample_image
 from slrig.importers.orders import ProjectorCode, slstudio_micro_sequence
 from slrig.importers.understanding import Understanding, understand
 from slrig.model import Axis, Black, FloatArray, Gray, LineShift, Pattern, Pixels, Sine, Size, White
+from tests.core import parametrize_core
 from tests.rendered_folders import pattern_light
 
 PROJECTOR = Size(200, 75)
@@ -76,20 +77,16 @@ ORDERS: dict[str, list[Pattern]] = {
     ],
     "lines": [*ENDS, *bits(Axis.COLUMN, cell=4), *LINES],
 }
-IN_THE_CORE = ("rows first, fine to coarse", "neither white nor black nor inverses", "lines")
-"""Images of most others are in another test of this file, too, or in tests of imported folders."""
 
 
-@pytest.mark.parametrize(
-    "order", [pytest.param(each, marks=[pytest.mark.slow] * (each not in IN_THE_CORE)) for each in ORDERS]
-)
+@pytest.mark.parametrize("order", [pytest.param(each, marks=[pytest.mark.slow] * (each != "lines")) for each in ORDERS])
 def test_orders_are_found_from_the_images(order: str) -> None:
     shown = ORDERS[order]
     found = understood(photographed(shown, noise=4.0))
     assert found.patterns == shown
 
 
-@pytest.mark.parametrize("inverses", [True, False])
+@parametrize_core("inverses", [True, False])
 def test_bits_in_an_order_of_no_program_are_taken_for_what_they_show_and_doubted(*, inverses: bool) -> None:
     columns = bits(Axis.COLUMN, inverses=inverses)
     per_bit = 2 if inverses else 1
@@ -101,6 +98,7 @@ def test_bits_in_an_order_of_no_program_are_taken_for_what_they_show_and_doubted
     ]
 
 
+@pytest.mark.slow
 def test_one_factor_of_light_per_image_is_free_and_named() -> None:
     shown = ORDERS["both axes, references last"]
     found = understood(photographed(shown, factors=[1 + 0.3 * np.sin(2.1 * place) for place in range(len(shown))]))
@@ -132,6 +130,7 @@ def test_a_bit_without_any_image_is_named() -> None:
         understood(photographed([*shown[:3], *shown[4:]]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "rest",
     [pytest.param([], id="alone"), *(pytest.param(each, marks=pytest.mark.slow) for each in (LINES, ROWS))],
@@ -146,9 +145,7 @@ def test_a_code_with_an_inverted_first_bit_is_mirrored(rest: list[Pattern]) -> N
     assert any("the code of columns is mirrored" in doubt.text for doubt in found.doubts)
 
 
-@pytest.mark.parametrize(
-    ("cell", "period", "steps"), [(16, 16.0, 4), pytest.param(16, 16.0, 3, marks=pytest.mark.slow), (8, 32.0, 8)]
-)
+@pytest.mark.parametrize(("cell", "period", "steps"), [(8, 32.0, 8), pytest.param(16, 16.0, 3, marks=pytest.mark.slow)])
 def test_sinusoids_beside_a_code_are_named(cell: int, period: float, steps: int) -> None:
     shown = [*ENDS, *bits(Axis.COLUMN, cell=cell), *(Sine(Axis.COLUMN, period, k, steps) for k in range(steps))]
     assert understood(photographed(shown)).patterns == shown
@@ -177,15 +174,17 @@ SINUSOIDS: dict[str, list[Pattern]] = {
 }
 
 
-@pytest.mark.parametrize("kind", SINUSOIDS)
-@pytest.mark.parametrize("gamma", [pytest.param(1.0, marks=pytest.mark.slow), 2.2])
-def test_sinusoids_of_several_periods_are_found_from_the_images(kind: str, gamma: float) -> None:
-    images = [(255 * (each / 255) ** gamma).astype(np.uint8) for each in photographed(SINUSOIDS[kind])]
+@pytest.mark.parametrize(
+    "kind", [pytest.param(each, marks=[pytest.mark.slow] * (each != "three periods")) for each in SINUSOIDS]
+)
+def test_sinusoids_of_several_periods_are_found_from_the_images(kind: str) -> None:
+    images = [(255 * (each / 255) ** 2.2).astype(np.uint8) for each in photographed(SINUSOIDS[kind])]
     found = understood(images)
     assert found.patterns == SINUSOIDS[kind]
     assert not found.doubts
 
 
+@pytest.mark.slow
 def test_periods_that_the_images_do_not_determine_are_doubtful() -> None:
     found = understood(photographed([*ENDS, *joined(shifted(Axis.COLUMN, 256, 64, 16, steps=4))]))
     assert len(found.doubts) == 1

@@ -27,6 +27,7 @@ from slrig.errors import FrameTimeoutError, ScanEvidenceError, UnsupportedByDevi
 from slrig.jobs.listener import Listener
 from slrig.model import FloatArray, Frame, PatternSequence, Pinhole, Pixels, Size, White
 from slrig.patterns.sequence import encode, scan_patterns
+from tests.core import parametrize_core
 from tests.unit.capture.fake_rig import CameraFaults, fake_rig
 from tests.unit.simulated_rig.building import FACING_PLATE, head_options
 
@@ -192,6 +193,7 @@ def test_triggered_camera_that_sees_no_flash_happen_still_shows_late_light(tmp_p
     assert "no flash was seen as it happened" in found.found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("is_stated", "name"), [(True, "timing.stamps"), (False, "timing.jitter")])
 def test_vague_time_stamps_are_not_blamed_on_the_projector(rig: Rig, is_stated: bool, name: str) -> None:
     """Stamps are off by 10 ms either way, at random, and the camera states that or does not."""
@@ -215,6 +217,7 @@ def test_vague_time_stamps_are_not_blamed_on_the_projector(rig: Rig, is_stated: 
     assert ("they limit the measurement" in found.found) is is_stated
 
 
+@pytest.mark.slow
 def test_exposure_that_a_dim_camera_declares_and_refuses_ends_the_search_alone(rig: Rig) -> None:
     def dimmed(frame: Frame) -> Frame:
         return replace(frame, image=frame.image // 8)
@@ -225,7 +228,7 @@ def test_exposure_that_a_dim_camera_declares_and_refuses_ends_the_search_alone(r
     assert {"exposure.range", "timing.late", "flicker.none"} <= names(diagnosis, Severity.OK)
 
 
-@pytest.mark.parametrize("halfway_s", [0.0, 1 / 60])
+@parametrize_core("halfway_s", [0.0, 1 / 60])
 def test_pictures_that_nobody_sent_are_named(rig: Rig, monkeypatch: pytest.MonkeyPatch, halfway_s: float) -> None:
     found = measure_latency(rig, trials=8)
     eye = replace(found.cameras["eye"], halfway_s=halfway_s)
@@ -238,6 +241,7 @@ def test_pictures_that_nobody_sent_are_named(rig: Rig, monkeypatch: pytest.Monke
     assert all("stands halfway for 16.7 ms" in each for each in said)
 
 
+@pytest.mark.slow
 def test_rig_without_calibration_has_its_picture_checked_and_its_drivers_notes_reported(rig: Rig) -> None:
     slow = with_camera(rig, triggers=frozenset({Trigger.FREE}), notes=("gives 5 frames per second",))
     diagnosis = run_doctor(replace(slow, calibration=None))
@@ -257,6 +261,7 @@ def test_camera_triggered_by_wire_is_skipped_and_named(rig: Rig) -> None:
     assert diagnosis.exposures == {}
 
 
+@pytest.mark.slow
 def test_projector_that_holds_its_patterns_is_examined_with_them(rig: Rig) -> None:
     diagnosis = run_doctor(holding(rig, own(rig)))
     assert diagnosis.with_severity(Severity.FAULT) == ()
@@ -267,6 +272,7 @@ def test_projector_that_holds_its_patterns_is_examined_with_them(rig: Rig) -> No
     assert diagnosis.synchronisation is None
 
 
+@pytest.mark.slow
 def test_projector_of_one_bit_has_no_response(rig: Rig) -> None:
     diagnosis = run_doctor(holding(rig, doctor_sequence(rig.projector.info.size), greys=True))
     assert diagnosis.healthy
@@ -274,7 +280,13 @@ def test_projector_of_one_bit_has_no_response(rig: Rig) -> None:
     assert "patterns.own" not in names(diagnosis, Severity.OK)
 
 
-@pytest.mark.parametrize(("late", "name"), [([9, 17], "patterns.verified"), (range(9, 999), "patterns.contradicted")])
+@pytest.mark.parametrize(
+    ("late", "name"),
+    [
+        ([9, 17], "patterns.verified"),
+        pytest.param(range(9, 999), "patterns.contradicted", marks=pytest.mark.slow),
+    ],
+)
 def test_frames_that_contradict_are_shot_once_more(rig: Rig, late: Container[int], name: str) -> None:
     """Frames of the pattern before, as of a display that missed its refresh; now and then, or from the tenth on."""
     frames: list[Frame] = []
@@ -331,9 +343,13 @@ def zoomed(profile: Pixels) -> Pixels:
     return np.asarray(cv2.remap(profile, columns, rows, cv2.INTER_LINEAR), np.uint8).reshape(profile.shape)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("process", "severity", "words"),
-    [(lambda profile: profile, Severity.OK, "disagree by 0."), (zoomed, Severity.FAULT, "overscan or digital zoom")],
+    [
+        pytest.param(lambda profile: profile, Severity.OK, "disagree by 0.", marks=pytest.mark.slow),
+        (zoomed, Severity.FAULT, "overscan or digital zoom"),
+    ],
 )
 def test_zoom_that_was_changed_since_the_calibration_is_named(
     printed: Rig, process: Process, severity: Severity, words: str
@@ -351,7 +367,7 @@ def test_zoom_that_was_changed_since_the_calibration_is_named(
     assert check_calibrated("eye", light, picture, None) == []
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("response", "gamma", "is_limited", "names"),
     [
         (0.6, 2.2, False, {"response.gamma", "response.camera"}),
@@ -376,7 +392,7 @@ def test_what_the_camera_makes_of_light_is_not_blamed_on_the_projector(
     assert (curve.black_knee, curve.white_knee) == pytest.approx((16, 235) if is_limited else (0, 255), abs=3)
 
 
-@pytest.mark.parametrize("response", [1.0, 0.5])
+@parametrize_core("response", [1.0, 0.5], core=[0, 1])
 @pytest.mark.parametrize(
     ("takes", "name", "taken_s"),
     [
@@ -441,7 +457,7 @@ def after(*steps: Process) -> Process:
     return process
 
 
-@pytest.mark.parametrize(("process", "severity"), [(lambda image: image, Severity.OK), (blur, Severity.FAULT)])
+@parametrize_core(("process", "severity"), [(lambda image: image, Severity.OK), (blur, Severity.FAULT)])
 def test_a_lens_that_moves_after_its_focus_was_measured_is_named(
     rig: Rig, process: Process, severity: Severity
 ) -> None:
@@ -480,6 +496,7 @@ def check_processed(rig: Rig, process: Process, *, calibrated: bool = True) -> F
     return found
 
 
+@pytest.mark.slow
 def test_an_unsharp_mask_is_named_with_its_cost(printed: Rig) -> None:
     found = check_processed(printed, unsharp(1.5))
     assert (found.name, found.severity) == ("sharpening.halo", Severity.FAULT)
@@ -547,6 +564,7 @@ def test_the_direction_of_the_current_is_found_before_all_other_checks(tmp_path:
     assert not diagnosis.exposures
 
 
+@pytest.mark.slow
 def test_the_least_period_of_the_trigger_is_measured_where_a_camera_states_a_shorter_one() -> None:
     readout = CameraFaults(min_period_s=0.0115, readout_s=0.0044)
     every = {"eye": frozenset(Trigger)}

@@ -34,6 +34,7 @@ from slrig.doctor.rig_file import write_rig_file
 from slrig.doctor.timing import LightFlicker, estimate_refresh_hz, exposure_attenuation, find_oscillations
 from slrig.errors import ConfigError, StorageError
 from slrig.model import FloatArray, Pinhole, Pixels, Size
+from tests.core import parametrize_core
 
 SHAPE = (60, 80)
 PICTURE = (120, 160)
@@ -114,6 +115,7 @@ def sample_light(t_s: FloatArray, exposure_s: float, *parts: tuple[float, float]
     return np.asarray(light)
 
 
+@pytest.mark.slow
 def test_oscillations_are_found_in_uneven_samples_at_any_mean_rate() -> None:
     t_s = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.05, 128))
     found = find_oscillations(t_s, sample_light(t_s, 0.002, (100.0, 5.0), (180.0, 2.0)), exposure_s=0.002)
@@ -221,9 +223,10 @@ def bars(period_px: float, blur_px: float, camera_px: float, *, noise_dn: float 
     return np.asarray(100 * np.tile(seen, (50, 1)) + noise_dn * 2**0.5 * rng.standard_normal((50, 200)))
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("blur_px", "camera_px", "noise_dn"),
     [(0.5, 1.6, 0.0), (0.5, 0.8, 5.0), (1.0, 0.8, 5.0), (2.5, 1.6, 5.0), (6.0, 0.8, 0.0)],
+    core=[0, 4],
 )
 def test_bars_give_the_blur(blur_px: float, camera_px: float, noise_dn: float) -> None:
     contrast = np.full((50, 200), 100.0)

@@ -10,6 +10,7 @@ import pytest
 
 from slrig.meshing.flips import GAMMA, Constraint, constraint, prefers_flip
 from slrig.model import FlipRule, FloatArray
+from tests.core import parametrize_core
 
 
 def angle(a: FloatArray, b: FloatArray, c: FloatArray) -> float:
@@ -53,7 +54,7 @@ GAMMAS = [math.pi / 6, 0.2, math.pi / 2, 2.5]
 
 
 @pytest.mark.parametrize("kind", TETRAHEDRA)
-@pytest.mark.parametrize("gamma", GAMMAS)
+@parametrize_core("gamma", GAMMAS, core=[0, 1])
 @pytest.mark.parametrize("rule", FlipRule)
 def test_the_verdict_is_that_of_the_angles(kind: str, gamma: float, rule: FlipRule) -> None:
     rng = np.random.default_rng(17)

@@ -12,6 +12,7 @@ import trimesh
 from slrig.meshing.quality import TruthScore, mesh_figures, score, weighted_percentiles
 from slrig.meshing.topology import open_borders
 from slrig.model import FloatArray, Mesh, Surface
+from tests.core import parametrize_core
 from tests.unit.meshing.plain import grid_faces, joined, mesh_of, soup
 
 
@@ -124,7 +125,7 @@ def test_the_truth_itself_is_without_error() -> None:
     assert found.nonmanifold_edges == found.misoriented_edges == found.duplicate_faces == found.degenerate_faces == 0
 
 
-@pytest.mark.parametrize("shift_mm", [0.07, -0.2, 0.4])
+@parametrize_core("shift_mm", [0.07, -0.2, 0.4])
 def test_a_shifted_plane_is_off_by_the_shift_everywhere(shift_mm: float) -> None:
     found = scored(flat(shift_mm))
     for figure in (found.rms_mm, found.p50_mm, found.p95_mm, found.p99_mm):

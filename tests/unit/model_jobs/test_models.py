@@ -53,6 +53,7 @@ from slrig.scan.job import plan_from_json as scan_plan_from_json
 from slrig.scan.job import plan_json as scan_plan_json
 from slrig.scan.job import series
 from slrig.scan.plan import ScanPlan
+from tests.core import parametrize_core
 from tests.unit.capture.fake_rig import FakeTurntable
 from tests.unit.model_jobs.model_bench import ModelBench, kept_scan, model_files, until_told
 from tests.unit.scan.fakes import WAIT_S, TameProjector, tame_calibration
@@ -114,6 +115,7 @@ def test_where_no_axis_was_measured_the_rigs_own_counts_in_the_frame_of_its_own_
     bench.close()
 
 
+@pytest.mark.slow
 def test_views_are_cut_by_the_stages_planes_and_the_axis_found_is_noted(tmp_path: Path) -> None:
     covariance = np.diag([1e-4, 1e-4, 0.0, 1e-8, 1e-8, 0.0])
     bench = ModelBench(tmp_path, axis=MeasuredAxis(np.zeros(3), np.array([0.0, 0.0, 1.0]), covariance))
@@ -193,6 +195,7 @@ def test_scans_that_a_model_needs_stay_until_it_is_over(bench: ModelBench) -> No
     assert list(bench.folder.incoming.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_models_beyond_the_limit_go_with_their_files(bench: ModelBench) -> None:
     plan = ModelPlan(bench.kept_scans(0.0, 40.0), TurntablePoses(AXIS))
     made = [bench.over(bench.models.combine(plan).id).id for _ in range(3)]
@@ -220,6 +223,7 @@ def cut_off(bench: ModelBench, *, attempts: int, files: bool = False) -> UUID:
     return model_id
 
 
+@pytest.mark.slow
 def test_what_was_cut_off_is_made_again_and_no_file_is_lost(tmp_path: Path) -> None:
     killed = ModelBench(tmp_path, start=False)
     queued, once, thrice = (cut_off(killed, attempts=attempts) for attempts in (0, 1, 3))
@@ -336,6 +340,7 @@ def test_all_views_are_shot_around_the_table_and_the_model_is_made_of_them(shoot
     assert "notes" not in made.summary
 
 
+@pytest.mark.slow
 def test_last_view_that_ends_before_its_progress_is_recorded_is_no_first_one(
     shooting: ShootingBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -348,6 +353,7 @@ def test_last_view_that_ends_before_its_progress_is_recorded_is_no_first_one(
     assert [each.detail for each in told] == ["view 4 of 4"]
 
 
+@pytest.mark.slow
 def test_failed_view_is_noted_and_a_device_fault_is_tried_twice_more(shooting: ShootingBench) -> None:
     gone = DeviceGoneError("left was unplugged")
     shooting.faults = {90.0: [ScanEvidenceError("white is not brighter than black")], 180.0: [gone], 270.0: [gone] * 9}
@@ -365,6 +371,7 @@ def test_failed_view_is_noted_and_a_device_fault_is_tried_twice_more(shooting: S
     assert [matrix[0][3] for matrix in used.poses.matrices] == [0.0, 2.0]
 
 
+@pytest.mark.slow
 def test_of_fewer_than_two_views_there_is_no_model_and_the_scans_stay(shooting: ShootingBench) -> None:
     shooting.faults = {angle: [ScanEvidenceError("too dark")] for angle in (90.0, 180.0, 270.0)}
     model_id = started(shooting)
@@ -414,6 +421,7 @@ def test_what_cannot_be_shot_is_refused_and_nothing_is_on_record(tmp_path: Path)
     bench.close()
 
 
+@pytest.mark.slow
 def test_by_hand_it_may_end_early_with_what_there_is(tmp_path: Path) -> None:
     bench = ShootingBench(tmp_path, table=False)
     model_id = started(bench, shoot_plan(4, manual=True))
@@ -515,11 +523,11 @@ def combining(bench: ShootingBench, model_id: UUID) -> None:
     bench.store.advance(model_id, JobState.COMPUTING)
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("leave", "shot"),
     [
         (left(), [0.0, 90.0, 180.0, 270.0]),
-        pytest.param(between_views, [90.0, 180.0, 270.0], marks=pytest.mark.slow),
+        (between_views, [90.0, 180.0, 270.0]),
         (left(DONE, CAPTURING, QUEUED, QUEUED), [180.0, 270.0, 90.0]),
         # The table lost its place.
         (left(DONE, DONE, QUEUED, QUEUED, count="before"), [180.0, 270.0, 0.0, 90.0]),
@@ -528,6 +536,7 @@ def combining(bench: ShootingBench, model_id: UUID) -> None:
         (combining, []),
     ],
     ids=["nothing", "between views", "within a view", "another place", "all shot", "named", "combining"],
+    core=[2, 4],
 )
 def test_after_a_kill_exactly_the_missing_views_are_shot(
     tmp_path: Path, leave: Callable[[ShootingBench, UUID], None], shot: list[float]
@@ -543,7 +552,7 @@ def test_after_a_kill_exactly_the_missing_views_are_shot(
     bench.close()
 
 
-@pytest.mark.parametrize(("first_was_shot", "shot"), [(True, []), (False, [0.0])])
+@parametrize_core(("first_was_shot", "shot"), [(True, []), (False, [0.0])])
 def test_after_a_kill_a_model_by_hand_waits_where_it_was(
     tmp_path: Path, first_was_shot: bool, shot: list[float]
 ) -> None:
@@ -562,6 +571,7 @@ def test_after_a_kill_a_model_by_hand_waits_where_it_was(
     bench.close()
 
 
+@pytest.mark.slow
 def test_a_cancellation_that_was_cut_off_is_completed_at_the_next_start(tmp_path: Path) -> None:
     def cancelled(bench: ShootingBench, model_id: UUID) -> None:
         between_views(bench, model_id)

@@ -48,6 +48,7 @@ def test_three_views_are_registered_from_a_wrong_axis(three: Turned) -> None:
     assert np.rad2deg(axis.angles_rad) == pytest.approx(ANGLES, abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_vase_is_free_to_turn_about_its_axis_and_keeps_the_starting_angle() -> None:
     turned = seen(vase, ANGLES, pitch_mm=1.0)
     views, starts = turned.noisy(1, length_mm=2.0), wrong_axis(ANGLES)
@@ -64,6 +65,7 @@ def test_a_vase_is_free_to_turn_about_its_axis_and_keeps_the_starting_angle() ->
         assert across < np.deg2rad(0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noisy", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_two_planes_have_three_free_motions(*, noisy: bool) -> None:
     turned = plane([0.0, 3.0])
@@ -73,6 +75,7 @@ def test_two_planes_have_three_free_motions(*, noisy: bool) -> None:
     assert displacement_mm(turned.exact[1], found.poses[1], turned.poses[1]) < 0.01
 
 
+@pytest.mark.slow
 def test_a_view_that_overlaps_no_other_is_named() -> None:
     turned = seen(bumpy, [0.0, 40.0, 180.0], pitch_mm=2.0)
     with pytest.raises(RegistrationRefusedError, match=r"^back: .* share more than 2% of the surface"):
@@ -81,6 +84,7 @@ def test_a_view_that_overlaps_no_other_is_named() -> None:
         register_views(turned.exact[:1], turned.poses[:1])
 
 
+@pytest.mark.slow
 def test_a_view_of_another_shape_is_named(three: Turned) -> None:
     stretched = replace(three.exact[1], vertices_mm=three.exact[1].vertices_mm * np.float32(1.03))
     views = [three.exact[0], stretched, three.exact[2]]

@@ -10,6 +10,7 @@ from slrig.calibration.board import DEFAULT_BOARD
 from slrig.errors import TurntableRefusedError
 from slrig.model import FloatArray, MeasuredAxis, update_axis
 from slrig.multiview.turntable import BoardAxis, axis_from_board
+from tests.core import parametrize_core
 
 POINT_MM = np.array([12.0, 60.0, 480.0])
 DIRECTION = np.array([0.05, -0.93, -0.36]) / np.linalg.norm([0.05, -0.93, -0.36])
@@ -78,7 +79,7 @@ def test_the_sense_of_stated_angles_is_that_of_the_axis() -> None:
     assert axis_found(SIX_DEG, stated=-SIX_DEG).axis.direction @ DIRECTION < -0.99
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("angles_deg", "slipped", "words"),
     [
         (SIX_DEG[:2], (slice(0), 0.0), "found 2"),
@@ -87,6 +88,7 @@ def test_the_sense_of_stated_angles_is_that_of_the_axis() -> None:
         (SIX_DEG, (slice(3, None), 0.6), "slipped between 'pose 3' and 'pose 4'"),
         (SIX_DEG, (slice(1, None, 2), 3.0), "off by .* mm rms, 'pose"),
     ],
+    core=[0, 2],
 )
 def test_poses_that_determine_no_axis_are_refused(
     angles_deg: FloatArray, slipped: tuple[slice, float], words: str

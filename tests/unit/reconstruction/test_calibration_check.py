@@ -23,6 +23,7 @@ from slrig.reconstruction import (
     find_cross_line_pairs,
 )
 from slrig.reconstruction.identification import StripeEnsemble
+from tests.core import parametrize_core
 
 CODES = Gray(Axis.COLUMN, 0, 10), Gray(Axis.ROW, 0, 9)
 Turn = tuple[float, float, float]
@@ -180,12 +181,7 @@ MISTAKES: dict[str, tuple[Callable[[PixelPairs], Case], str]] = {
 }
 
 
-IN_THE_CORE = ("inverse pose", "bits exchanged")
-
-
-@pytest.mark.parametrize(
-    "mistake", [pytest.param(each, marks=[pytest.mark.slow] * (each not in IN_THE_CORE)) for each in MISTAKES]
-)
+@parametrize_core("mistake", MISTAKES)
 def test_mistake_refutes_the_calibration_and_is_named(pairs: PixelPairs, mistake: str) -> None:
     make, cause = MISTAKES[mistake]
 
@@ -256,6 +252,7 @@ def test_one_frame_of_rows_agrees_with_the_right_calibration(
     assert check.median_px < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "cause"),
     [
@@ -329,9 +326,14 @@ def test_two_cameras_that_agree_need_no_calibrated_projector(rows: FloatArray) -
 @pytest.mark.parametrize(
     ("second", "is_mirrored", "words"),
     [
-        (inverse_pose(SECOND), False, "the inverse pose (rotation and translation from camera 'right' to"),
+        pytest.param(
+            inverse_pose(SECOND),
+            False,
+            "the inverse pose (rotation and translation from camera 'right' to",
+            marks=pytest.mark.slow,
+        ),
         (turned(SECOND, (1.0, 0, 0)), False, "camera 'right' has another pose relative to camera 'left'"),
-        (SECOND, True, "the picture of camera 'right' is mirrored left to right"),
+        pytest.param(SECOND, True, "the picture of camera 'right' is mirrored left to right", marks=pytest.mark.slow),
     ],
 )
 def test_two_cameras_refute_a_wrong_calibration_and_name_its_mistake(

@@ -261,13 +261,18 @@ def test_without_a_normal_the_viewing_ray_is_used() -> None:
     assert share(calibration, points, unknown) == pytest.approx(along, rel=1e-4)
 
 
-def test_a_calibration_without_covariance_has_no_modes_and_an_exact_one_no_share() -> None:
+def test_a_calibration_without_covariance_has_no_modes() -> None:
+    assert calibration_modes(Calibration({"left": left_camera()}, light_source()), ["left"], Axis.COLUMN) is None
+
+
+@slow
+def test_an_exact_calibration_has_no_share() -> None:
     plain = Calibration({"left": left_camera()}, light_source())
-    assert calibration_modes(plain, ["left"], Axis.COLUMN) is None
     exact = Calibration(plain.cameras, plain.projector, SolveRecord("id", "now", np.zeros((30, 30)), BOX, 0.0))
     assert (share(exact, *surface(5, 9)) == 0).all()
 
 
+@slow
 def test_a_volume_that_no_device_sees_is_refused() -> None:
     calibration = calibrated({"left": left_camera()}, light_source())
     assert calibration.solved is not None

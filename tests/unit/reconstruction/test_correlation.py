@@ -13,6 +13,7 @@ from scipy.ndimage import convolve
 from slrig.model import FloatArray, NoiseModel
 from slrig.reconstruction.camera_response import PixelSum, edge_pixel_sum, estimate_noise, noise_correlation
 from slrig.reconstruction.frames import AxisFrames
+from tests.core import parametrize_core
 from tests.unit.reconstruction.builders import code_frames, grid
 
 SHAPE = (300, 400)
@@ -59,7 +60,7 @@ def by_sums(kernel: FloatArray, summed: PixelSum) -> float:
 @pytest.mark.parametrize("summed", [PHASES, PixelSum(STENCIL), edge_pixel_sum(1.0)], ids=["phases", "values", "edges"])
 @pytest.mark.parametrize(
     "kernel",
-    [SMOOTH, ((0, 0, 0), (0.25, 0.5, 0.25), (0, 0, 0))],
+    [SMOOTH, pytest.param(((0, 0, 0), (0.25, 0.5, 0.25), (0, 0, 0)), marks=pytest.mark.slow)],
     ids=["interpolated", "along rows"],
 )
 def test_sums_err_more_by_noise_that_neighbours_share(kernel: Kernel, summed: PixelSum) -> None:
@@ -69,7 +70,7 @@ def test_sums_err_more_by_noise_that_neighbours_share(kernel: Kernel, summed: Pi
     assert noise_correlation(frames, estimate_noise(frames), EVERYWHERE, summed) == pytest.approx(expected, rel=0.08)
 
 
-@pytest.mark.parametrize("summed", [PHASES, PixelSum(STENCIL), edge_pixel_sum(1.0)], ids=["phases", "values", "edges"])
+@parametrize_core("summed", [PHASES, PixelSum(STENCIL), edge_pixel_sum(1.0)], ids=["phases", "values", "edges"])
 def test_independent_noise_stays_as_it_is(summed: PixelSum) -> None:
     frames = noisy(ALONE)
     assert noise_correlation(frames, estimate_noise(frames), EVERYWHERE, summed) == 1.0
@@ -103,14 +104,17 @@ def lit_by_walls(frames: AxisFrames) -> AxisFrames:
     return replace(frames, bits=bits, inverses=inverses, white=frames.white + glow)
 
 
-@pytest.mark.parametrize("summed", [PHASES, PixelSum(STENCIL), edge_pixel_sum(1.0)], ids=["phases", "values", "edges"])
-@pytest.mark.parametrize("kernel", [ALONE, SMOOTH], ids=["independent", "interpolated"])
+@parametrize_core("summed", [PHASES, PixelSum(STENCIL), edge_pixel_sum(1.0)], ids=["phases", "values", "edges"])
+@pytest.mark.parametrize(
+    "kernel", [pytest.param(ALONE, marks=pytest.mark.slow), SMOOTH], ids=["independent", "interpolated"]
+)
 def test_light_from_walls_around_is_no_noise_that_neighbours_share(kernel: Kernel, summed: PixelSum) -> None:
     frames = lit_by_walls(noisy(kernel))
     expected = by_sums(np.array(kernel), summed)
     assert noise_correlation(frames, estimate_noise(frames), EVERYWHERE, summed) == pytest.approx(expected, rel=0.1)
 
 
+@pytest.mark.slow
 def test_light_from_elsewhere_is_no_noise_of_edges_whichever_bits_there_are() -> None:
     x, y = grid(SHAPE)
     frames = noisy(SMOOTH)

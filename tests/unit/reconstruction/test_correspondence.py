@@ -188,7 +188,14 @@ def test_crossings_are_those_of_plain_numpy(down: bool) -> None:
     np.testing.assert_allclose(along, wanted[:, 1] + wanted[:, 2], atol=2e-5)
 
 
-@pytest.mark.parametrize(("period_px", "paired", "most_px"), [(0, True, 0.03), (8, True, 0.03), (0, False, 0.05)])
+@pytest.mark.parametrize(
+    ("period_px", "paired", "most_px"),
+    [
+        (8, True, 0.03),
+        pytest.param(0, True, 0.03, marks=pytest.mark.slow),
+        pytest.param(0, False, 0.05, marks=pytest.mark.slow),
+    ],
+)
 def test_positions_are_right_within_their_stated_deviation(period_px: int, paired: bool, most_px: float) -> None:
     # Without inverses the middle of white and black stands for them.
     seen, off = Wall().found(period_px=period_px, paired=paired)

@@ -218,6 +218,7 @@ def test_stated_noise_matches_actual_noise() -> None:
         assert ratio == pytest.approx(1, abs=0.12), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("exposures_s", "most"),
     # A short exposure's read noise weighs heavily where there is little light: it may not make the sum worse.

@@ -12,6 +12,7 @@ from slrig.model import Axis, FloatArray, IntArray, Pinhole, Refusal, Size, lens
 from slrig.model.lens_kernels import undistort
 from slrig.reconstruction.identification import StripeEnsemble
 from slrig.reconstruction.triangulation import intersect_light_sheets, normalised_from_pixel, pack_device
+from tests.core import parametrize_core
 from tests.unit.reconstruction.builders import ensemble_of, looking
 
 LENGTHS = (1, 3, 255, 256, 257, 600)  # of curves: blocks that are full, and what is left over
@@ -94,7 +95,7 @@ def scattered(seed: int) -> StripeEnsemble:
 
 
 @pytest.mark.parametrize("axis", list(Axis))
-@pytest.mark.parametrize("seed", range(2))
+@parametrize_core("seed", range(2))
 def test_blocks_of_points_give_what_each_point_gives(seed: int, axis: Axis) -> None:
     camera, projector = rig(seed, axis)
     ensemble = scattered(seed)

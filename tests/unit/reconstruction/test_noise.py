@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from slrig.model import FloatArray, NoiseModel
 from slrig.reconstruction.camera_response import estimate_noise
 from slrig.reconstruction.frames import AxisFrames
+from tests.core import parametrize_core
 from tests.unit.reconstruction.builders import code_frames, grid
 
 SHAPE = (240, 320)
@@ -50,7 +51,7 @@ def frames_with_noise(
 
 
 @CAMERAS
-@pytest.mark.parametrize("paired", [True, False], ids=["inverses", "neighbours"])
+@parametrize_core("paired", [True, False], ids=["inverses", "neighbours"])
 def test_the_variance_of_dark_and_bright_pixels_is_recovered(
     read_variance: float, slope: float, *, paired: bool
 ) -> None:

@@ -30,6 +30,7 @@ from slrig.patterns.sequence import scan_patterns
 from slrig.reconstruction.decoded_image import CodeTables, ReconstructionLimits
 from slrig.reconstruction.frames import FrameStacks, axis_frames, axis_patterns, reference_repeats, used_shots
 from slrig.reconstruction.pipeline import CameraCurves, CameraStream, camera_curves
+from tests.core import parametrize_core
 from tests.unit.reconstruction.builders import grid, rms, seen_by_camera
 
 CAMERA = Size(210, 100)
@@ -251,7 +252,7 @@ def require_equal(one: CameraCurves, other: CameraCurves) -> None:
     assert one.refusal.tobytes() == other.refusal.tobytes()
 
 
-@pytest.mark.parametrize("line_shift", [True, False])
+@pytest.mark.parametrize("line_shift", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_frames_that_come_one_by_one_in_any_order_give_the_same_bits(line_shift: bool) -> None:
     capture = rendered(cliff, patterns(line_shift=line_shift, cell_px=None if line_shift else 2))
     wanted = walk(capture)[0]
@@ -324,7 +325,11 @@ def misses_px(curves: CameraCurves, slope: float, angle_rad: float) -> FloatArra
 
 @pytest.mark.parametrize(
     ("angle_rad", "axis"),
-    [(0.0, Axis.COLUMN), (math.pi / 6, Axis.ROW), (math.pi / 2, Axis.ROW), (-2.5, Axis.COLUMN)],
+    [
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in ((0.0, Axis.COLUMN), (math.pi / 2, Axis.ROW))),
+        (math.pi / 6, Axis.ROW),
+        (-2.5, Axis.COLUMN),
+    ],
 )
 def test_stripes_of_any_direction_and_axis_are_refined(angle_rad: float, axis: Axis) -> None:
     curves, _ = walk(seen_tilted(0.9, angle_rad, axis=axis, blur_px=0.8), axis=axis)
@@ -341,7 +346,7 @@ def test_stripes_of_any_direction_and_axis_are_refined(angle_rad: float, axis: A
     assert rms(errors / curves.ensemble.sigma_px) == pytest.approx(1.0, abs=0.15)
 
 
-@pytest.mark.parametrize("slope", [0.5, 1.6])
+@parametrize_core("slope", [0.5, 1.6])
 def test_refined_points_are_no_worse_than_those_of_their_own_frame(slope: float) -> None:
     capture = seen_tilted(slope, 0.2, blur_px=0.9 * slope, noise=1.5)
     found = []
@@ -359,9 +364,9 @@ def test_refined_points_are_no_worse_than_those_of_their_own_frame(slope: float)
 @pytest.mark.parametrize(
     ("slope", "light", "seed"),
     [
-        (0.6, {"noise": 0.8, "blur_px": 0.7}, 1),
+        pytest.param(0.6, {"noise": 0.8, "blur_px": 0.7}, 1, marks=pytest.mark.slow),
         (0.9, {"noise": 4.0, "blur_px": 0.7}, 4),
-        (1.4, {"noise": 2.0, "blur_px": 0.7}, 2),
+        pytest.param(1.4, {"noise": 2.0, "blur_px": 0.7}, 2, marks=pytest.mark.slow),
         # Ten grey levels of contrast.
         (0.9, {"noise": 0.8, "blur_px": 0.6, "white": 12.0}, 3),
     ],
@@ -436,6 +441,7 @@ def test_of_half_period_lines_every_pixel_that_one_crosses_has_a_point(halves: C
     assert counts[[0, 1, -2, -1]].sum() == 0
 
 
+@pytest.mark.slow
 def test_half_period_lines_in_changing_light_are_not_refined(halves: Capture) -> None:
     changed = LineShift(Axis.COLUMN, 3, 8, 4)
     capture = replace(halves, shots=tuple(

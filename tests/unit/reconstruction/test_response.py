@@ -16,6 +16,7 @@ from slrig.reconstruction.camera_response import estimate_gamma, linearisation_g
 from slrig.reconstruction.decoded_image import linearise_frames
 from slrig.reconstruction.decoding import DecodingLimits
 from slrig.reconstruction.frames import AxisFrames, FrameStacks
+from tests.core import parametrize_core
 from tests.unit.reconstruction.builders import code_frames, grid
 
 SHAPE = (240, 400)
@@ -55,19 +56,21 @@ def seen_by(
     )
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("gamma", "seen"),
     [(1.8, {}), (2.6, {}), (2.2, {"room": 0.2}), (2.6, {"room": 0.2}), (1.8, {"quality": 0.3})],
     ids=["1.8", "2.6", "2.2, bright room", "2.6, bright room", "1.8, dark plate"],
+    core=[1, 2],
 )
 def test_gamma_is_estimated_from_edges_of_the_code(gamma: float, seen: dict[str, Any]) -> None:
     assert estimate_gamma(seen_by(gamma, **seen)) == pytest.approx(gamma, rel=0.05)
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     "seen",
     [{}, {"unsharp": 1.5}, {"signal_blur_px": 1.5}, {"room": 0.2, "unsharp": 1.0}],
     ids=["as it is", "sharpened", "behind a scaler", "in a bright room"],
+    core=[0, 1],
 )
 def test_values_in_proportion_to_light_stay_as_they_are(seen: dict[str, Any]) -> None:
     assert estimate_gamma(seen_by(1.0, **seen)) == 1.0

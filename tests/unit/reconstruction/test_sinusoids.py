@@ -119,14 +119,11 @@ SEQUENCES: dict[str, tuple[tuple[Sine, ...], int | None]] = {
     "three periods": (THREE_PERIODS, None), "2x3": (TWO_PERIODS, None), "micro": (MICRO, None),
 }  # fmt: skip
 """Patterns, and the cell of their Gray code."""
-DEAR = {("three periods", 1.0), ("three periods", 2.2), ("2x3", 1.0), ("2x3", 2.2), ("micro", 2.2)}
 
 
-@pytest.mark.parametrize(
-    ("name", "gamma"),
-    [pytest.param(name, gamma, marks=[pytest.mark.slow] * ((name, gamma) in DEAR))
-     for name in SEQUENCES for gamma in (1.0, 2.2)],
-)  # fmt: skip
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SEQUENCES)
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
 def test_positions_reach_the_bound_of_their_light(name: str, gamma: float) -> None:
     patterns, cell_px = SEQUENCES[name]
     position_px = slope()
@@ -139,6 +136,7 @@ def test_positions_reach_the_bound_of_their_light(name: str, gamma: float) -> No
     assert 0.8 <= np.quantile(np.abs(error_px / found.measured.sigma)[known], 0.6827) <= 1.25
 
 
+@pytest.mark.slow
 def test_a_pixel_has_the_least_squares_of_all_its_frames() -> None:
     position_px = slope(16, 20)
     frames, code = frames_of(THREE_PERIODS, position_px)
@@ -158,6 +156,7 @@ def test_a_pixel_has_the_least_squares_of_all_its_frames() -> None:
         )
 
 
+@pytest.mark.slow
 def test_clipped_pixels_have_no_position() -> None:
     frames, code = frames_of(FOUR_STEPS, slope(), cell_px=8, brighter=1.6)
     clipped = np.max([np.asarray(image) for image in frames.sinusoids], axis=0) >= 255
@@ -167,6 +166,7 @@ def test_clipped_pixels_have_no_position() -> None:
     assert np.isnan(found.measured.position[clipped]).all()
 
 
+@pytest.mark.slow
 def test_pixels_too_dark_for_the_number_of_their_period_are_refused() -> None:
     position_px, noise = slope(40), NoiseModel(30.0, 0.02)
     frames, code = frames_of(TWO_PERIODS, position_px, noise=noise, brighter=0.3, has_reference=False)
@@ -176,6 +176,7 @@ def test_pixels_too_dark_for_the_number_of_their_period_are_refused() -> None:
     assert (error_px > 30).mean() < 0.01
 
 
+@pytest.mark.slow
 def test_three_shifts_alone_do_not_tell_gamma() -> None:
     frames, code = frames_of(played((1024.0, 3)), slope(), gamma=2.2, has_reference=False)
     assert np.isnan(located(frames, code).response.gamma)
@@ -204,6 +205,7 @@ CODE = tuple(Gray(Axis.COLUMN, bit, 3, 16, 0, inverted) for bit in range(3) for 
 ENDS = (White(), Black())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "patterns",
     [pytest.param((*ENDS, *CODE, *FOUR_STEPS), id="white, black, Gray", marks=pytest.mark.slow),
@@ -235,6 +237,7 @@ def tables_of(frames: AxisFrames, extent_px: int) -> CodeTables:
     return CodeTables(index_of_word(frames.gray), cell_positions(positions, size), levels)
 
 
+@pytest.mark.slow
 def test_a_second_axis_of_sinusoids_has_their_positions() -> None:
     x, y = grid((30, 80))
     position_px = 20 + 0.6 * x + 0.1 * y
@@ -245,6 +248,7 @@ def test_a_second_axis_of_sinusoids_has_their_positions() -> None:
     assert rms(error_px[np.isfinite(error_px)]) < 0.1
 
 
+@pytest.mark.slow
 def test_a_bracket_of_sinusoids_measures_what_its_longest_exposure_clips() -> None:
     x, y = grid((30, 120))
     position_px = 10 + 0.8 * x + 0.03 * y

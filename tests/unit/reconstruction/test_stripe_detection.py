@@ -28,6 +28,7 @@ from slrig.reconstruction.stripes import (
     stripe_points,
     taylor_step,
 )
+from tests.core import parametrize_core
 from tests.unit.reconstruction.builders import gaussian_stripe, grid
 
 SHAPE = (80, 90)
@@ -78,7 +79,7 @@ def taylor_oracle(r: FloatArray, kind: int) -> tuple[float, float, float]:
 
 
 @KINDS
-@pytest.mark.parametrize(("sigma", "shape"), [(1.0, (70, 45)), (2.5, (40, 33)), (1.4, (70, 6))])
+@parametrize_core(("sigma", "shape"), [(1.0, (70, 45)), (2.5, (40, 33)), (1.4, (70, 6))], core=[0, 2])
 def test_the_first_step_is_stegers_equation(kind: int, sigma: float, shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(9)
     # More than one block of rows; narrower than the kernel, too: borders are reflected about the outermost pixels.
@@ -291,10 +292,11 @@ def edge_errors(light: NDArray[np.float64], truth_px: NDArray[np.float64], noise
     return np.asarray(off * np.abs(points.normals[:, 0]) / points.sigma_px)
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("first_px", "growth", "blur_px"),
     [(40.0, 0.0, 0.6), (40.0, 0.0, 0.1), (3.0, 0.0, 0.6), (3.3, 0.0, 0.2), (6.0, 0.02, 0.6), (2.4, 0.01, 0.3)],
     ids=["wide", "sharp", "narrow", "narrow and sharp", "wider and wider", "narrow, wider and wider"],
+    core=[0, 3],
 )
 def test_the_deviation_of_an_edge_holds_for_narrow_sharp_and_uneven_stripes(
     first_px: float, growth: float, blur_px: float

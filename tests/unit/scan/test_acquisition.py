@@ -39,6 +39,7 @@ from slrig.scan.plan import PatternPlan, PresetUse, ScanPlan
 from slrig.scan.report import capture_notes, capture_report
 from tests.contract.benches import simulated
 from tests.contract.suite import rig_of
+from tests.core import parametrize_core
 from tests.samples import sample_calibration
 from tests.unit.capture.fake_rig import CameraFaults, FakeRig, FakeTurntable, fake_rig
 from tests.unit.doctor.test_doctor import OtherCamera, small_rig
@@ -127,7 +128,7 @@ def test_a_rig_whose_latency_was_never_measured_says_so(tmp_path: Path) -> None:
     assert not (tmp_path / "triggered" / "notes.json").exists()
 
 
-@pytest.mark.parametrize("measured", [None, Synchronisation(0.0, 0.001)])
+@parametrize_core("measured", [None, Synchronisation(0.0, 0.001)])
 def test_frames_that_light_is_too_late_for_ask_to_measure_it(tmp_path: Path, measured: Synchronisation | None) -> None:
     plan = ScanPlan(PatternPlan(line_shift=False, gray_cell_px=16))
     with small_rig(tmp_path, faults={"light_delay_s": 0.15}) as rig:
@@ -205,7 +206,8 @@ def test_a_frame_that_was_shot_again_is_right_in_the_bundle_and_the_report_says_
     )
 
 
-@pytest.mark.parametrize(
+@pytest.mark.slow
+@parametrize_core(
     ("faults", "whole"),
     # A bit is judged as it comes, before anything else sees it; a line frame beside its inverse, which has come before.
     [({"garbled": frozenset({13})}, False), ({"garbled": frozenset({5})}, True)],
@@ -227,7 +229,7 @@ def test_a_reconstruction_that_was_fed_a_frame_that_is_replaced_reads_the_bundle
     assert isinstance(sent[-1], Abandon) is not whole
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("faults", "kind", "partner"),
     [
         # A line frame is doubted beside its inverse.
@@ -272,7 +274,7 @@ def test_a_device_that_is_gone_and_a_cancel_after_a_refusal_leave_nothing(tmp_pa
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("exposing", "one_s", "bracket_s", "bent"),
     [
         ({}, 0.016, (), 1),
@@ -537,6 +539,7 @@ def test_the_sequence_is_played_once_for_each_exposure_from_short_to_long(tmp_pa
     assert told[-1] == (1.0, f"frame {2 * COUNT} of {2 * COUNT}")
 
 
+@pytest.mark.slow
 def test_a_frame_that_fails_is_shot_again_at_its_own_exposure(tmp_path: Path) -> None:
     sink, rig = Sink(), exposed_rig()
     rig.cameras["right"].faults.garbled = frozenset({COUNT + 13})
@@ -551,6 +554,7 @@ def test_a_frame_that_fails_is_shot_again_at_its_own_exposure(tmp_path: Path) ->
     assert str(sink.evidence) == f"{COUNT}/{COUNT} patterns verified, 2 frames shot again"
 
 
+@pytest.mark.slow
 def test_an_exposure_that_is_too_long_or_too_short_is_left_out_and_the_report_says_so(tmp_path: Path) -> None:
     rig, sink = exposed_rig(), Sink()
     told = bracketed(rig, tmp_path / "bundle", (0.0001, 0.005, 0.01, 0.08, 0.16), sink=sink)
@@ -611,6 +615,7 @@ def test_a_lamp_that_goes_off_is_not_taken_for_a_short_exposure(tmp_path: Path) 
     assert every({"right": (0.005,)}) <= frames_of(tmp_path / "bundle")
 
 
+@pytest.mark.slow
 def test_a_bracket_of_which_nothing_is_of_use_ends_the_scan(tmp_path: Path) -> None:
     assert "no exposure of the bracket is of use to camera 'right': 0.0002 s is too dark" in ended(
         exposed_rig(), tmp_path / "dark", (0.0001, 0.0002)
@@ -619,6 +624,7 @@ def test_a_bracket_of_which_nothing_is_of_use_ends_the_scan(tmp_path: Path) -> N
     assert "no exposure of the bracket is of use to camera 'right': 0.08 s is too bright" in told
 
 
+@pytest.mark.slow
 def test_frames_that_are_wrong_at_one_exposure_for_good_end_the_scan(tmp_path: Path) -> None:
     rig = exposed_rig()
     rig.cameras["right"].faults.garbled = frozenset(range(COUNT + 13, 1000))

@@ -46,6 +46,7 @@ from slrig.model import Calibration
 from slrig.rig.session import ActiveCalibration, RigSession
 from slrig.scan.job import ScanJob, cancel_series, plan_from_json, scans_of, series
 from slrig.scan.plan import PatternPlan, ScanPlan, SeriesPlace, series_of
+from tests.core import parametrize_core
 from tests.unit.scan.bench import Bench, failure_code
 from tests.unit.scan.fakes import WAIT_S, TameBench, tame_calibration
 
@@ -69,7 +70,7 @@ def test_scan_walks_to_its_mesh(bench: Bench) -> None:
 # What the rig and the disk refuse
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     "error",
     [
         BundleError("Frame 3 equals frame 2."),
@@ -86,7 +87,7 @@ def test_what_is_no_fault_of_a_device_leaves_the_rig_open(bench: Bench, error: S
     assert len(bench.opened) == 1
 
 
-@pytest.mark.parametrize("error", [OSError(errno.EIO, "Input/output error"), DeviceError("no"), ZeroDivisionError()])
+@parametrize_core("error", [OSError(errno.EIO, "Input/output error"), DeviceError("no"), ZeroDivisionError()], core=[1])
 def test_driver_that_cannot_blank_or_close_stops_nothing(bench: Bench, error: Exception) -> None:
     scan = bench.held()
     camera, projector = bench.opened[0]
@@ -114,7 +115,7 @@ def test_projector_that_stays_lit_is_told(bench: Bench) -> None:
     assert bench.manager.status().fault in {silent, "No projector on ttyUSB0."}
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     "error",
     [
         DeviceGoneError("No camera on usb-3."),
@@ -122,6 +123,7 @@ def test_projector_that_stays_lit_is_told(bench: Bench) -> None:
         DriverNotFoundError("no driver 'x'"),
         CalibrationError("not finite"),
     ],
+    core=[1],
 )
 def test_rig_that_cannot_be_opened_fails_the_scan_and_a_wrong_rig_file_is_given_up(
     tmp_path: Path, error: SlrigError
@@ -340,6 +342,7 @@ def test_scans_of_a_series_are_shot_one_after_the_other_when_their_time_has_come
         assert start >= place(scan).due_at - timedelta(milliseconds=1)
 
 
+@pytest.mark.slow
 def test_others_pass_a_scan_that_waits_for_its_time_and_a_series_is_cancelled_as_a_whole(bench: Bench) -> None:
     first, *others = begun(bench, repeat=3, every_s=HOUR_S)
     assert place(others[0]).due_at - place(first).due_at == timedelta(seconds=HOUR_S)
@@ -357,6 +360,7 @@ def test_others_pass_a_scan_that_waits_for_its_time_and_a_series_is_cancelled_as
         cancel_series(bench.manager, uuid4())
 
 
+@pytest.mark.slow
 def test_a_series_goes_on_after_a_restart(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     plans = series_of(ScanPlan(), UUID(int=7), count=2, every_s=HOUR_S, begins_at=utc_now() - timedelta(seconds=60))
@@ -373,7 +377,7 @@ def test_a_series_goes_on_after_a_restart(tmp_path: Path) -> None:
 # Records that the disk refuses for a while
 
 
-@pytest.mark.parametrize("then", ["scan", "close", "cancel", "delete"])
+@parametrize_core("then", ["scan", "close", "cancel", "delete"])
 def test_ending_that_the_disk_refused_is_recorded_before_what_comes_next(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, then: str
 ) -> None:
@@ -404,6 +408,7 @@ def test_ending_that_the_disk_refused_is_recorded_before_what_comes_next(
     assert bench.store.get(scan_id).state is JobState.SUCCEEDED
 
 
+@pytest.mark.slow
 def test_worker_that_cannot_be_started_again_strands_no_scan(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     scan = bench.held()
     waiting = bench.scan(wait=True)
@@ -464,6 +469,7 @@ def assert_own(bench: Bench, record: JobRecord) -> None:
     assert record.summary["bundle"] == str(record.id)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("refused", "begins", "lasting"),
     [

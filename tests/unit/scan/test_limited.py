@@ -201,6 +201,7 @@ def test_a_camera_that_is_not_there_is_no_region(scanned: Scanned) -> None:
         scanned(Region(polygons_px={"middle": ((0.0, 0.0), (9.0, 0.0), (9.0, 9.0))}))
 
 
+@pytest.mark.slow
 def test_a_region_without_a_surface_and_one_out_of_sight_are_told_apart(scanned: Scanned) -> None:
     with pytest.raises(ConfigError, match="nothing of it is in the image of camera"):
         scanned(Region(box_mm=((5000.0, 0.0, 0.0), (5001.0, 1.0, 1.0))))

@@ -12,6 +12,7 @@ from slrig.model import FloatArray, Mesh, Pinhole, Refusal, Size
 from slrig.scan import clouds as module
 from slrig.scan.clouds import OrganisedCloud, encode_depth_tiff, encode_npz, encode_pcd, organised
 from slrig.scan.pictures import described_causes
+from tests.core import parametrize_core
 
 SIZE = Size(48, 40)
 CAUSES = [each["name"] for each in described_causes()]
@@ -106,8 +107,8 @@ def check_against_plain(cloud: OrganisedCloud, expected: dict[str, FloatArray]) 
         assert (finite == (cloud.cause == 0)[..., None]).all(), name
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.2, -0.5, 0.1)], ids=["ahead", "turned"])
+@parametrize_core("threads", [1, 2], core=[1])
+@parametrize_core("turn", [(0.0, 0.0, 0.0), (0.2, -0.5, 0.1)], ids=["ahead", "turned"], core=[1])
 @pytest.mark.parametrize("lens", LENSES, ids=["ideal", "barrel", "pincushion"])
 def test_a_pixel_has_the_point_of_the_nearest_triangle_on_its_ray(
     monkeypatch: pytest.MonkeyPatch, lens: tuple[float, ...], turn: tuple[float, float, float], threads: int

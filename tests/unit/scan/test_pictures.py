@@ -28,6 +28,7 @@ from slrig.scan.pictures import (
     resized,
 )
 from slrig.scan.thumbnail import BACKDROP, encode_thumbnail
+from tests.core import parametrize_core
 from tests.unit.scan.test_mesh_formats import only
 
 SIZE = Size(640, 480)
@@ -243,7 +244,7 @@ def test_refused_pixels_have_their_cause_in_colour_and_legend() -> None:
     assert not np.array_equal(rejection_picture(few)[:, 500:], rejection_picture(many)[:, 500:])
 
 
-@pytest.mark.parametrize("shape", [(12, 16), (1024, 1280), (3000, 4096), (40, 3000)])
+@parametrize_core("shape", [(12, 16), (1024, 1280), (3000, 4096), (40, 3000)])
 def test_a_rejection_picture_of_any_camera_is_legible(shape: tuple[int, int]) -> None:
     picture = rejection_picture(np.full(shape, Refusal.SHADOW_EDGE, dtype=np.uint8))
     assert 330 < picture.shape[1] <= 1600

@@ -60,6 +60,7 @@ from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle, reconstruct_into
 from slrig.scan.report import calibration_report
 from slrig.scan.stream import LiveScan, ScanStream
+from tests.core import parametrize_core
 from tests.golden.test_light_axis import BALL, Device, rig_file
 from tests.prepared_bundles import prepared_bundle
 
@@ -202,7 +203,7 @@ def without(*kinds: str, bit: int | None = None) -> Callable[[Shot, Capture], Sh
     return change
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("change", "error", "words"),
     [
         (flat(0), NothingToReconstructError, "no pixel could be decoded.*lens cap"),
@@ -211,6 +212,7 @@ def without(*kinds: str, bit: int | None = None) -> Callable[[Shot, Capture], Sh
         (without("white", "inverse"), PatternError, "bits have no threshold"),
     ],
     ids=["dark", "bright", "a missing bit", "no white and no inverses"],
+    core=[0, 1],
 )
 def test_frames_that_tell_nothing_are_refused(
     recorded: Path,
@@ -240,6 +242,7 @@ def test_a_code_that_names_columns_that_the_projector_has_not_is_refused(recorde
     assert "lens cap" not in words
 
 
+@pytest.mark.slow
 def test_a_rotation_of_the_inverse_direction_is_no_fault_of_the_light(recorded: Path, tmp_path: Path) -> None:
     bundle = shutil.copytree(recorded, tmp_path / "bundle")
     known = read_calibration(bundle / "calibration.json")
@@ -256,6 +259,7 @@ def test_a_rotation_of_the_inverse_direction_is_no_fault_of_the_light(recorded: 
     assert "lens cap" not in words
 
 
+@pytest.mark.slow
 def test_lines_that_were_never_shown_are_made_up_for_by_code_edges_and_told(recorded: Path, tmp_path: Path) -> None:
     dark = {shot.camera: shot.image for shot in read_bundle(recorded).capture.shots if shot.pattern == 1}
 
@@ -425,6 +429,7 @@ def test_lines_before_the_code_and_black_before_white_change_nothing(both_axes: 
     assert other["evidence"] == played[1]["evidence"]
 
 
+@pytest.mark.slow
 def test_what_frames_prove_is_what_they_prove_together(both_axes: Path, tmp_path: Path) -> None:
     bundle = read_bundle(both_axes)
     capture = bundle.capture
@@ -468,6 +473,7 @@ def test_frames_are_let_go_when_they_are_not_needed(both_axes: Path) -> None:
     assert not any(each() is not None for _, each in held)
 
 
+@pytest.mark.slow
 def test_axes_of_two_exposures_wait_for_one_another(both_axes: Path, tmp_path: Path) -> None:
     def exposed(shot: Shot, capture: Capture) -> Shot:
         row = getattr(capture.patterns[shot.pattern], "axis", None) is Axis.ROW

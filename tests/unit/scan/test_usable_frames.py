@@ -13,6 +13,7 @@ from slrig.bundle import BundleFiles, open_bundle, write_bundle
 from slrig.capture.verifier import EvidenceSummary, check_capture
 from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, Shot, Sine, White
 from slrig.scan.preparation import UsableFiles, rebuilt_image, usable_files
+from tests.core import parametrize_core
 from tests.unit.capture.fake_rig import PROJECTOR, Scene, patterns_for
 
 PATTERNS: tuple[Pattern, ...] = patterns_for(rows=True)
@@ -60,6 +61,7 @@ def test_a_bit_without_a_right_frame_and_a_line_frame_are_left_out(tmp_path: Pat
     assert "left out" in usable.note
 
 
+@pytest.mark.slow
 def test_wrong_frames_of_the_other_axis_do_not_matter(tmp_path: Path) -> None:
     files, evidence = bundle(tmp_path / "b", {ROW_BIT + 1: ROW_BIT})
     assert evidence.wrong == {"left": frozenset({ROW_BIT + 1})}
@@ -69,6 +71,7 @@ def test_wrong_frames_of_the_other_axis_do_not_matter(tmp_path: Path) -> None:
     assert usable_files(right, nothing_wrong, None) is None
 
 
+@pytest.mark.slow
 def test_light_that_changes_within_a_pair_is_evened_out(tmp_path: Path) -> None:
     shots = tuple(
         replace(shot, image=np.rint(shot.image * (0.7 if shot.pattern % 2 else 1.0)).astype(np.uint8))
@@ -107,7 +110,7 @@ def shifted(period_px: float, steps: int) -> tuple[Pattern, ...]:
     return tuple(Sine(Axis.COLUMN, period_px, shift, steps) for shift in range(steps))
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     "patterns",
     [
         (White(), Black(), *shifted(128, 4), *shifted(16, 4)),
@@ -116,8 +119,9 @@ def shifted(period_px: float, steps: int) -> tuple[Pattern, ...]:
         (White(), Black(), *(Gray(Axis.COLUMN, bit, 4, 8) for bit in range(4)), *shifted(16, 4)),
     ],
     ids=["two of four", "2x3", "without white and black", "a code and four"],
+    core=[0, 3],
 )
-@pytest.mark.parametrize("scaler_px", [0.0, 0.7])
+@parametrize_core("scaler_px", [0.0, 0.7], core=[1])
 def test_a_wrong_sinusoid_is_rebuilt_from_its_other_shifts(
     tmp_path: Path, patterns: tuple[Pattern, ...], scaler_px: float
 ) -> None:

@@ -14,6 +14,7 @@ from simulated_rig.device import SimulatedHead
 from simulated_rig.scene import build_surface, read_scene
 from slrig.model import FloatArray, IntArray
 from slrig.scan.formats import encode_mesh_glb
+from tests.core import parametrize_core
 from tests.unit.scan.test_mesh_formats import half_ball
 from tests.unit.simulated_rig.building import FACING_PLATE, small_head
 
@@ -124,7 +125,7 @@ def test_a_relief_has_the_height_of_its_formula(tmp_path: Path) -> None:
     scene = """
     [[object]]
     shape = "relief"
-    size_mm = [100.0, 80.0]
+    size_mm = [60.0, 50.0]
     step_mm = 0.25
     wave = [{ amplitude_mm = 3.0, wavelength_mm = 40.0, direction_deg = 90.0, phase_deg = 30.0 }]
     bump = [{ centre_mm = [5.0, -4.0], height_mm = 8.0, sigma_mm = 12.0 }]
@@ -183,7 +184,7 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@parametrize_core("shape", SHAPES, core=[0, 5])
 def test_triangles_run_counter_clockwise_seen_from_the_devices(tmp_path: Path, shape: str) -> None:
     head = small_head(tmp_path, f'[[object]]\nshape = "{shape}"\n{SHAPES[shape]}\n', camera=STRAIGHT)
     surface = head.truth().surface
@@ -204,6 +205,7 @@ def _directions_to(points: FloatArray) -> FloatArray:
     return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True))
 
 
+@pytest.mark.slow
 def test_facets_of_a_ball_stay_within_the_stated_error(tmp_path: Path) -> None:
     for radius in (3.0, 20.0, 60.0):
         (tmp_path / "s.toml").write_text(f'[[object]]\nshape = "sphere"\nradius_mm = {radius}\n')

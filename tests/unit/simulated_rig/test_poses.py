@@ -17,6 +17,7 @@ from slrig.calibration.board import Board as Designed
 from slrig.calibration.board import BoardKind
 from slrig.errors import ConfigError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import FloatArray, Pixels
+from tests.core import parametrize_core
 from tests.rendered_boards import board_head, board_options, board_scene
 from tests.unit.simulated_rig.building import FACING_PLATE, coarser, corners_in_world_mm, frames_of, small_head
 
@@ -97,7 +98,7 @@ def test_a_board_that_does_not_fit_is_refused() -> None:
         generate_poses(PoseSeries(count=4), huge, DEVICES)
 
 
-@pytest.mark.parametrize("table", [{"tilt_deg": [30.0, 10.0]}, {"tilt_deg": [10.0, 80.0]}, {"depth_mm": [5.0, 4.0]}])
+@parametrize_core("table", [{"tilt_deg": [30.0, 10.0]}, {"tilt_deg": [10.0, 80.0]}, {"depth_mm": [5.0, 4.0]}])
 def test_a_series_with_crossed_bounds_is_refused(tmp_path: Path, table: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match="minimum <= maximum"):
         head_of(tmp_path, poses=table)
@@ -116,6 +117,7 @@ def test_listed_poses_come_before_made_up_ones_and_the_first_is_taken_at_the_sta
     assert np.abs(first.astype(int) - other).mean() > 10
 
 
+@pytest.mark.slow
 def test_a_pose_looks_the_same_however_it_was_reached(tmp_path: Path) -> None:
     walked, straight = (head_of(tmp_path / str(k), pose=[ONE, TWO]) for k in range(2))
     for head, path in ((walked, (1, 0, 1)), (straight, (1,))):

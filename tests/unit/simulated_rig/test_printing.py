@@ -16,6 +16,7 @@ from simulated_rig.rendering import CameraView, SceneState
 from simulated_rig.scene import PrintedBoard, Scene, SceneSurface, build_surface, rotation_matrix
 from simulated_rig.transport import Hits, build_caster, trace_rays
 from slrig.model import FloatArray, Pinhole, Size
+from tests.core import parametrize_core
 from tests.unit.reconstruction.builders import opencv_pixels, opencv_rays
 from tests.unit.simulated_rig.building import corners_in_world_mm
 from tests.unit.simulated_rig.test_boards import dark_at
@@ -36,11 +37,6 @@ KINDS: dict[str, dict[str, Any]] = {
     "charuco": {"columns": 7, "rows": 5, "square_mm": 24.0, "marker_mm": 18.0, "dictionary": "DICT_4X4_50"},
     "circles": {"columns": 4, "rows": 9, "square_mm": 15.0, "circle_mm": 14.0},
 }
-
-
-def slow(value: object) -> Any:
-    """One more case, for the long run."""
-    return pytest.param(value, marks=pytest.mark.slow)
 
 
 def board(kind: str, **options: Any) -> PrintedBoard:
@@ -85,7 +81,7 @@ def traced(each: PrintedBoard, u: FloatArray, v: FloatArray, footprint_px: float
     return trace_rays(u, v, EYE, LAMP, world, rays, working_distance_mm=430.0, footprint_px=footprint_px)
 
 
-@pytest.mark.parametrize("kind", ["charuco", slow("chessboard"), slow("circles")])
+@parametrize_core("kind", ["charuco", "chessboard", "circles"])
 def test_a_cell_has_the_mean_albedo_of_what_it_sees(kind: str) -> None:
     each, side, fine = board(kind), 0.5, 80
     rng = np.random.default_rng(5)
@@ -140,6 +136,7 @@ def test_two_samples_a_side_place_edges_as_eight_do() -> None:
         assert float(np.sqrt((shift**2).mean())) < 0.02
 
 
+@pytest.mark.slow
 def test_discs_have_their_area_and_centroid() -> None:
     each = board("circles")
     light, shown = (picture(one) for one in (board("circles", albedo_dark=0.8499), each))

@@ -17,6 +17,7 @@ from simulated_rig.options import SimulatedCameraOptions, SimulatedProjectorOpti
 from simulated_rig.rendering import CameraView, SceneState
 from simulated_rig.scene import Scene, build_surface
 from slrig.model import FloatArray
+from tests.core import parametrize_core
 from tests.unit.simulated_rig.building import line_profile
 
 FOCAL_PX = 3000.0
@@ -68,7 +69,7 @@ def stripes(samples_per_axis: int, blur_px: float) -> tuple[FloatArray, FloatArr
     return lines / white, centres
 
 
-@pytest.mark.parametrize("blur_px", [0.6, 0.9])
+@parametrize_core("blur_px", [0.6, 0.9])
 @pytest.mark.parametrize("samples_per_axis", [3, 4])
 def test_the_lens_takes_away_what_would_alias(samples_per_axis: int, blur_px: float) -> None:
     """Lines of a column each, at 1.16 columns per pixel: a blur after the pixels would keep each stripe's displacement.

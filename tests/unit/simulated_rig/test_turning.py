@@ -74,6 +74,7 @@ def test_objects_may_be_named(tmp_path: Path) -> None:
     assert not np.array_equal(vertices(head)[-4:], before[-4:])
 
 
+@pytest.mark.slow
 def test_its_angle_errs_by_scale_and_at_random_as_configured(tmp_path: Path) -> None:
     def stops(seed: int, times: int) -> list[float]:
         head, table = head_of(tmp_path, seed=seed, scale_error=0.01, angle_sigma_deg=0.2)
