@@ -74,6 +74,7 @@ def test_other_rooms_import_what_a_room_exports() -> None:
     assert bypassing == set()
 
 
+@pytest.mark.slow
 def test_the_service_loads_no_mathematics() -> None:
     """A package that exports mathematics is imported by the worker and by commands that compute, not by the service."""
     heavy = ("numba", "scipy.optimize", "scipy.spatial")

@@ -99,6 +99,7 @@ def test_only_one_module_compiles_kernels() -> None:
     assert own == ["slrig/kernels.py"]
 
 
+@pytest.mark.slow
 def test_every_name_that_a_test_replaces_is_there() -> None:
     # Neither types nor the tests of the core see that a test of a long part replaces a name that moved.
     modules = {".".join(path.relative_to(ROOT).with_suffix("").parts): each for path, each in SOURCES.items()}
@@ -284,6 +285,7 @@ def dangling(source: Source) -> Iterator[str]:
             yield f"{source.name}: `{name}`"
 
 
+@pytest.mark.slow
 def test_dotted_names_in_docstrings_exist() -> None:
     assert exists(["slrig", "model", "Pinhole"])
     assert exists(["slrig", "model", "geometry", "Pinhole", "centre_mm"])

@@ -120,7 +120,7 @@ def test_doctor_advises_and_a_scan_takes_no_wrong_frame(name: str) -> None:
         )
 
 
-@pytest.mark.parametrize("stamp", ["start", "first packet", "end"])
+@pytest.mark.parametrize("stamp", ["end", pytest.param("first packet", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("measured_s", "scanned_s"), [(0.15, 1 / 60), (1 / 60, 0.1)])
 def test_scan_at_another_exposure_than_the_latency_was_measured_at_takes_no_wrong_frame(
     stamp: str, measured_s: float, scanned_s: float

@@ -108,10 +108,10 @@ def pace_s(rig: Rig) -> tuple[float, int]:
 @pytest.mark.parametrize(
     ("webcams", "exposure_s", "most"),
     [
-        pytest.param([Webcam()], 0.01, 1.1, id="short exposures"),
-        pytest.param([Webcam()], 1 / 30, 1.1, id="whole frames"),
+        pytest.param([Webcam()], 0.01, 1.1, id="short exposures", marks=pytest.mark.slow),
+        pytest.param([Webcam()], 1 / 30, 1.1, id="whole frames", marks=pytest.mark.slow),
         # A tenth of the patterns is shown again, for as long as the others.
-        pytest.param([Webcam(lost=0.1)], 0.01, 1.3, id="frames get lost"),
+        pytest.param([Webcam(lost=0.1)], 0.01, 1.3, id="frames get lost", marks=pytest.mark.slow),
         # Those that start alike run in phase, though starting takes a time that is no whole number of frames.
         pytest.param([Webcam(start_s=0.215)] * 2, 0.01, 1.1, id="two cameras"),
     ],

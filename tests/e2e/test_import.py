@@ -23,6 +23,7 @@ from slrig.model import Axis, Black, FloatArray, Gray, Pattern, Pixels, Size, Wh
 from slrig.patterns.sequence import encode
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
+from tests.core import parametrize_core
 from tests.e2e.conftest import write_rig
 from tests.golden.test_bundles import reconstructed
 from tests.rendered_folders import understand_folder_of
@@ -116,7 +117,9 @@ def imported(folder: Path, output: Path, *words: object, projector: str = "200x1
     return output
 
 
-@pytest.mark.parametrize("order", ["opencv", "white first", "black first", "without both", "scan3d", "slstudio"])
+@parametrize_core(
+    "order", ["opencv", "white first", "black first", "without both", "scan3d", "slstudio"], core=[0, 3, 4, 5]
+)
 def test_the_order_of_the_images_says_their_patterns(tmp_path: Path, order: str) -> None:
     program = order if order in SHOWN else "opencv"
     shown, wanted = photographed(program), OWN[program]
@@ -157,6 +160,7 @@ def test_names_by_a_template_and_by_a_list(tmp_path: Path) -> None:
         assert all((shot.image == shown[capture.patterns[shot.pattern]]).all() for shot in capture.shots)
 
 
+@pytest.mark.slow
 def test_what_does_not_fit_is_refused_in_words(tmp_path: Path) -> None:
     images, out = photographed("opencv"), tmp_path / "bundle"
     whole = lay_out(tmp_path / "whole", images)
@@ -349,56 +353,6 @@ def test_real_captures_are_imported_as_they_were_by_hand(
         assert one.pattern == other.pattern
         assert (one.image == other.image).all()
     assert (found.calibration is None) == (manual.calibration is None)
-
-
-# ---- images that contradict one another
-
-
-def by_hand(images: list[Pixels], kind: str) -> list[Pixels]:
-    """The images of a folder with a fault."""
-    found = list(images)
-    if kind == "first to the end":
-        return [*found[1:], found[0]]
-    if kind == "copy":
-        found[7] = found[6]
-    if kind == "exchanged":
-        found[15], found[17] = found[17], found[15]
-    if kind == "noise":
-        chance = np.random.default_rng(1)
-        return [np.clip(np.rint(image + chance.normal(0, 2, image.shape)), 0, 255).astype(np.uint8) for image in found]
-    return found
-
-
-@pytest.mark.shared
-@pytest.mark.parametrize(
-    ("kind", "words"),
-    [
-        pytest.param("right", "", marks=pytest.mark.slow),
-        pytest.param("noise", "", marks=pytest.mark.slow),
-        pytest.param("copy", "image graycode_07.png is a copy of image graycode_06.png", marks=pytest.mark.slow),
-        ("exchanged", "image graycode_15.png and image graycode_17.png are exchanged"),
-        pytest.param(
-            "first to the end",
-            "all frames are one frame ahead of their patterns: with the last frame moved to the front",
-            marks=pytest.mark.slow,
-        ),
-    ],
-)
-def test_images_that_contradict_are_named_at_import(shared: Path, tmp_path: Path, kind: str, words: str) -> None:
-    capture = shared / "cases" / "two_axes" / "capture"
-    if not capture.is_dir():
-        pytest.skip(f"no {capture}")
-    folder = tmp_path / "images"
-    folder.mkdir()
-    images = [
-        np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), np.uint8) for path in sorted(capture.glob("*.png"))
-    ]
-    for index, image in enumerate(by_hand(images, kind)):
-        assert cv2.imwrite(str(folder / f"graycode_{index:02}.png"), image)
-    result = slrig("import", folder, "--output", tmp_path / "bundle", "--projector", "640x400")
-    assert words in " ".join(result.output.split())
-    assert ("doubtful" in result.output) is (kind in ("copy", "exchanged"))
-    assert (result.exit_code, (tmp_path / "bundle").exists()) == ((2, False) if "ahead" in words else (0, True))
 
 
 # ---- folders that tell by themselves what they show

@@ -115,6 +115,7 @@ def test_shell_completes_commands() -> None:
     assert found.stdout.split() == ["scan", "schedule", "scans"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in Linux's /proc")
 def test_command_has_no_threads_that_spin() -> None:
     # numpy and scipy bring an OpenBLAS each, with a thread per core beside the first, all started when it is loaded.

@@ -46,6 +46,7 @@ def test_a_fleet_is_listed_with_its_ages(address: str, catalogue: Catalogue, mon
     assert [each["state"] for each in json.loads(told.output)["rigs"]] == ["busy", "unseen"]
 
 
+@pytest.mark.slow
 def test_a_service_says_what_its_catalogue_says_or_what_to_set(address: str, tmp_path: Path) -> None:
     without = ServedBench(tmp_path / "without")
     with client_of(without) as client:
@@ -69,6 +70,7 @@ def test_a_service_says_what_its_catalogue_says_or_what_to_set(address: str, tmp
     served.unpatch()
 
 
+@pytest.mark.slow
 def test_login_is_in_no_answer(postgres: Postgres, tmp_path: Path) -> None:
     login = tmp_path / "login"
     login.write_text(LOGIN + "\n")

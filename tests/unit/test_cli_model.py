@@ -291,6 +291,7 @@ def test_table_turns_and_a_view_that_fails_is_named(bench: Bench, tmp_path: Path
     assert len(json.loads((tmp_path / "model" / "report.json").read_bytes())["notes"]) == 6
 
 
+@pytest.mark.slow
 def test_what_cannot_be_shot_is_said(bench: Bench, tmp_path: Path) -> None:
     rig = ["--shoot", 9, "--rig", RIG, "--output", tmp_path]
     for words, asked in (

@@ -100,6 +100,7 @@ def within(folder: Path) -> list[str]:
     return sorted(each.name for each in folder.iterdir())
 
 
+@pytest.mark.slow
 def test_bundles_are_reconstructed_with_the_files_and_the_calibration_that_were_given(
     scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -133,6 +133,7 @@ def test_by_hand_one_position_is_measured_at_a_time_with_its_repeats(desk: Desk)
         desk.measure(test.id, wait=False, scripted=False)
 
 
+@pytest.mark.slow
 def test_a_position_that_went_wrong_may_be_measured_again(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     test = desk.open(the_plan)
 
@@ -225,6 +226,7 @@ def test_what_cannot_be_tested_is_refused(desk: Desk) -> None:
         desk.open(the_plan)
 
 
+@pytest.mark.slow
 def test_a_finished_test_and_its_report_outlive_the_service(desks: Desks, tmp_path: Path) -> None:
     before = desks()
     waiting, test = before.open(the_plan), before.open(the_plan)
@@ -253,7 +255,7 @@ def test_a_finished_test_and_its_report_outlive_the_service(desks: Desks, tmp_pa
     assert [each.id for each in desks().latest()] == [third.id, waiting.id]
 
 
-@pytest.mark.parametrize("ending", [PowerCut(), interruption_error()], ids=["killed", "ended in good order"])
+@pytest.mark.parametrize("ending", [pytest.param(PowerCut(), marks=pytest.mark.slow), interruption_error()], ids=repr)
 def test_test_that_was_cut_off_is_interrupted_and_goes_on(desks: Desks, ending: BaseException) -> None:
     before = desks()
     test = before.open(the_plan)

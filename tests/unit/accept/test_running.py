@@ -48,6 +48,7 @@ from slrig.jobs.database import Database
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration, FloatArray, Mesh
 from slrig.scan.artefacts import encode_mesh_ply
+from tests.core import parametrize_core
 from tests.unit.accept.test_plan import GOOD, VOLUME, device
 from tests.unit.jobs.tame_compute import TameCompute
 from tests.unit.jobs.tame_manager import TameManager
@@ -297,7 +298,7 @@ def test_the_page_holds_everything_and_says_what_it_is_not(
     assert "<script" not in page
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("asked", "error", "words"),
     [
         ({"names": ("sphere-1", "pose 2")}, UnsupportedByDeviceError, "needs the positions sphere-2, bar-1, plane-1"),
@@ -324,6 +325,7 @@ def test_a_cancelled_test_keeps_its_points_and_writes_no_report(
     assert sorted(path.name for path in kept) == ["1.npz", "2.npz"]
 
 
+@pytest.mark.slow
 def test_an_artefact_that_was_not_found_is_placed_again(run: Callable[..., AcceptanceResult]) -> None:
     plan = shortened("sphere-1", "sphere-2", repeats=1)
     placed: list[str] = []

@@ -215,6 +215,7 @@ def test_failed_solve_gives_its_error_and_no_files(calibrating: TestClient, serv
         assert refusal(calibrating, method, f"{here}{path}")[0] == 409, path
 
 
+@pytest.mark.slow
 def test_calibrations_are_imported_compared_and_refused(calibrating: TestClient, tmp_path: Path) -> None:
     client, path = calibrating, tmp_path / "sent.json"
 

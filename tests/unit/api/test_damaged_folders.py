@@ -13,6 +13,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from slrig.jobs.data_folder import check_files
+from tests.core import parametrize_core
 from tests.unit.api.conftest import ServedBench, client_of, ended
 from tests.unit.api.test_calibration import BOARD, opened, settled, shot
 
@@ -137,7 +138,7 @@ def test_damaged_files_of_results_are_reported_never_served_and_made_anew(
         shutil.rmtree(root)
 
 
-@pytest.mark.parametrize("kind", ["cut", "removed"])
+@parametrize_core("kind", ["cut", "removed"], core=[1])
 def test_damaged_files_that_were_made_on_request_are_made_anew(sound: Sound, tmp_path: Path, kind: str) -> None:
     root, rng = tmp_path / "data", np.random.default_rng(7)
     shutil.copytree(sound.root, root)
@@ -163,11 +164,12 @@ GARBAGE: dict[str, bytes | None] = {
 }
 
 
-@pytest.mark.parametrize("count", [3, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.slow
 @pytest.mark.parametrize("records", ["kept", "lost"])
 def test_service_starts_on_any_damaged_folder_and_serves_what_is_whole(
-    sound: Sound, tmp_path: Path, count: int, records: str
+    sound: Sound, tmp_path: Path, records: str
 ) -> None:
+    count = 100
     rng = np.random.default_rng(count)
     names = [name for name in sound.files if not name.startswith(("keys.json", "lock", "slrig.sqlite-"))]
     if records == "lost":

@@ -145,33 +145,31 @@ def test_views_wait_for_a_busy_rig_only_on_request(client: TestClient, served: S
     assert refusal(client, "POST", "/model/shoot", json={**BY_HAND, "if_busy": "reject"}) == (409, "/problems/rig-busy")
 
 
-@pytest.mark.parametrize(
-    ("status", "words", "request_body"),
-    [
-        (404, "No scan", {"scans": [0, str(uuid4())], "axis": AXIS}),
-        (422, "scans", {"scans": [0]}),
-        (422, "axis: expected that of the turntable", {"scans": [0, 1]}),
-        (422, "expected a rotation", {"scans": [0, 1], "poses": [STILL, MIRROR]}),
-        (422, "leave one of them out", {"scans": [0, 1], "poses": [STILL, STILL], "axis": AXIS}),
-        (422, "poses", {"scans": [0, 1], "poses": "somewhere"}),
-        (422, "expected the frames of each scan", {"scans": [0, 1], "poses": "markers"}),
-        (422, "dictionary", {"scans": [0, 1], "poses": "unknown", "dictionary": "DICT_4X4_50"}),
-        (422, "axis: expected that of the turntable", {"manual": True}),
-        (422, "views", {**BY_HAND, "views": 1}),
-        (422, "one for each of 3 scans", {"manual": True, "views": 3, "poses": [STILL, STILL]}),
-        (422, "repeat", {**BY_HAND, "scan": {"repeat": 2}}),
-        (422, "turn_deg", {**BY_HAND, "scan": {"turn_deg": 2}}),
-        (422, "one of", {**BY_HAND, "scan": {"exposure_s": 0.1, "exposures_s": [0.1, 0.2]}}),
-        (404, "none", {**BY_HAND, "scan": {"preset": "none"}}),
-    ],
-)
-def test_bad_request_for_a_model_is_refused_and_not_on_record(
-    client: TestClient, scans: list[str], status: int, words: str, request_body: dict[str, Any]
-) -> None:
+BAD_REQUESTS: list[tuple[int, str, dict[str, Any]]] = [
+    (404, "No scan", {"scans": [0, str(uuid4())], "axis": AXIS}),
+    (422, "scans", {"scans": [0]}),
+    (422, "axis: expected that of the turntable", {"scans": [0, 1]}),
+    (422, "expected a rotation", {"scans": [0, 1], "poses": [STILL, MIRROR]}),
+    (422, "leave one of them out", {"scans": [0, 1], "poses": [STILL, STILL], "axis": AXIS}),
+    (422, "poses", {"scans": [0, 1], "poses": "somewhere"}),
+    (422, "expected the frames of each scan", {"scans": [0, 1], "poses": "markers"}),
+    (422, "dictionary", {"scans": [0, 1], "poses": "unknown", "dictionary": "DICT_4X4_50"}),
+    (422, "axis: expected that of the turntable", {"manual": True}),
+    (422, "views", {**BY_HAND, "views": 1}),
+    (422, "one for each of 3 scans", {"manual": True, "views": 3, "poses": [STILL, STILL]}),
+    (422, "repeat", {**BY_HAND, "scan": {"repeat": 2}}),
+    (422, "turn_deg", {**BY_HAND, "scan": {"turn_deg": 2}}),
+    (422, "one of", {**BY_HAND, "scan": {"exposure_s": 0.1, "exposures_s": [0.1, 0.2]}}),
+    (404, "none", {**BY_HAND, "scan": {"preset": "none"}}),
+]
+
+
+def test_bad_request_for_a_model_is_refused_and_not_on_record(client: TestClient, scans: list[str]) -> None:
     """`scans` of a request: numbers stand for scans on record. Without them its views are shot."""
     known = client.get("/model").json()["models"], len(client.get("/scan").json()["scans"])
-    given = [scans[each] if isinstance(each, int) else each for each in request_body.get("scans", ())]
-    path, body = ("/model", {**request_body, "scans": given}) if given else ("/model/shoot", request_body)
-    refused = client.post(path, json=body)
-    assert (refused.status_code, words in refused.text) == (status, True), refused.text
+    for status, words, request_body in BAD_REQUESTS:
+        given = [scans[each] if isinstance(each, int) else each for each in request_body.get("scans", ())]
+        path, body = ("/model", {**request_body, "scans": given}) if given else ("/model/shoot", request_body)
+        refused = client.post(path, json=body)
+        assert (refused.status_code, words in refused.text) == (status, True), refused.text
     assert (client.get("/model").json()["models"], len(client.get("/scan").json()["scans"])) == known

@@ -155,6 +155,7 @@ class SlowConversions:
         return self._real(*given)
 
 
+@pytest.mark.slow
 def test_a_key_whose_conversions_hang_holds_up_nothing_else(
     client: TestClient, served: ServedBench, keys: Callable[..., TestClient], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -191,6 +191,7 @@ async def test_many_events_come_in_pieces_and_then_the_stream_waits(jobs: Jobs) 
     assert (await waiting)[0]["number"] == 43
 
 
+@pytest.mark.slow
 @on_loop
 async def test_twenty_clients_cost_little_more_than_one(jobs: Jobs) -> None:
     jobs.scan(steps=59)

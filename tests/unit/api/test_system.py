@@ -26,6 +26,7 @@ from slrig.doctor import job as examining
 from slrig.doctor import keep
 from slrig.errors import ScanEvidenceError
 from slrig.rig.watchdog import SettingsInUse
+from tests.core import parametrize_core
 from tests.unit.api.conftest import ServedBench, client_of, ended
 from tests.unit.api.test_access import PATHS, filled
 from tests.unit.command import done, refused, slrig
@@ -110,6 +111,7 @@ def test_an_examination_is_a_job_whose_result_is_shown_as_the_last(
     assert done["summary"]["checks"][0]["outcome"] == "passed"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("commands")
 def test_without_a_rig_file_the_commands_examine_the_rig_of_the_service(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -128,7 +130,7 @@ def test_without_a_rig_file_the_commands_examine_the_rig_of_the_service(
     assert "camera 'cam0' sees no flash" in refused(slrig("latency"))
 
 
-@pytest.mark.parametrize("kind", EXAMINATIONS)
+@parametrize_core("kind", EXAMINATIONS)
 def test_an_examination_holds_the_rig_and_can_be_cancelled(client: TestClient, served: ServedBench, kind: str) -> None:
     scan = served.held(client)
     refused = client.post(f"/rig/{kind}")
@@ -192,6 +194,7 @@ def test_an_observer_that_fails_keeps_nothing_from_the_others(client: TestClient
     assert client.get("/readyz").status_code == 200
 
 
+@pytest.mark.slow
 def test_service_whose_data_folder_is_gone_says_so(tmp_path: Path) -> None:
     # It is not started: nothing but requests uses its folder.
     idle = ServedBench(tmp_path / "data")

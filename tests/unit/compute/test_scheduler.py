@@ -41,6 +41,7 @@ from slrig.compute.scheduler import Scheduler, serve_scheduler
 from slrig.compute.security import KEY, MEMBER, PoolAddress, pool_address
 from slrig.errors import ConfigError, ServiceError, StorageError
 from slrig.failure import JobFailure
+from tests.core import parametrize_core
 from tests.unit.command import slrig
 from tests.unit.scan.fakes import never
 
@@ -225,7 +226,7 @@ RIG = Hello().model_dump_json().encode() + b"\n"
 ORDER = b'{"says": "request", "job": "%s", "versions": {}, "task": {}}\n' % (b"1" * 32)
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("peer", "words", "heard"),
     [
         (plain, RIG + ORDER, ""),
@@ -240,6 +241,7 @@ ORDER = b'{"says": "request", "job": "%s", "versions": {}, "task": {}}\n' % (b"1
         (a_member, RIG.replace(b":1", b":2"), "no message of a pool"),
         (a_member, b" " * (3 * LINE_BYTES), "no message of a pool"),
     ],
+    core=[0, 1, 2, 3],
 )
 def test_only_orders_of_members_reach_a_worker(
     peer: Callable[[PoolAddress, bytes], str], words: bytes, heard: str

@@ -14,6 +14,7 @@ from slrig.conformance import CHECKS, Check, CheckOutcome, CheckResult, Conforma
 from slrig.devices import CameraInfo, Rig, Synchronisation, Trigger
 from slrig.errors import DeviceBusyError
 from slrig.model import Calibration, CameraFormat, Frame, Pinhole, Size
+from tests.core import parametrize_core
 from tests.unit.conformance import model_rig as drivers
 from tests.unit.conformance.model_rig import (
     ALL,
@@ -164,7 +165,7 @@ def test_every_check_finds_a_broken_driver() -> None:
     assert {name for _, name, _ in BROKEN} == {check.name for check in CHECKS}
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("triggers", "plays", "not_applicable"),
     [
         (ALL, True, 1),
@@ -174,6 +175,7 @@ def test_every_check_finds_a_broken_driver() -> None:
         ({Trigger.HARDWARE}, True, 18),
     ],
     ids=lambda value: "-".join(sorted(value)) if isinstance(value, set | frozenset) else str(value),
+    core=[0, 2],
 )
 def test_a_rig_that_keeps_the_contract_has_a_full_score(
     triggers: set[Trigger], plays: bool, not_applicable: int

@@ -47,6 +47,7 @@ from slrig.model import Pixels
 from slrig.rig.session import RigSession
 from slrig.rig.watchdog import Watchdog
 from slrig.scan.plan import PatternPlan
+from tests.core import parametrize_core
 from tests.unit.conformance.model_rig import DeliversStale, Hangs, LightsLate, Maker, ModelProjector, StaysLit, sequence
 from tests.unit.jobs.tame_compute import TameCompute
 from tests.unit.scan.bench import PIPELINE
@@ -272,7 +273,7 @@ def rig(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("projector", "passed"), [(ModelProjector, 2), (LightsLate, 1)])
+@parametrize_core(("projector", "passed"), [(ModelProjector, 2), (LightsLate, 1)])
 def test_conform_prints_faults_and_remedies(
     rig: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, projector: type[ModelProjector], passed: int
 ) -> None:

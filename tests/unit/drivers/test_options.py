@@ -95,6 +95,7 @@ def test_a_finders_id_is_taken_by_device_or_by_what_a_model_marks() -> None:
     }
 
 
+@pytest.mark.slow
 def test_no_vendors_library_is_needed() -> None:
     code = (
         "import sys; sys.modules.update(dict.fromkeys(('depthai', 'gi', 'serial', 'sdl2')))\n"

@@ -39,6 +39,7 @@ from slrig.jobs.store import JobStore
 from slrig.rig.session import RigSession
 from slrig.scan.job import plan_from_json, plan_json
 from slrig.scan.plan import ScanPlan
+from tests.core import parametrize_core
 from tests.unit.command import refused, slrig
 from tests.unit.jobs.tame_compute import TameCompute
 from tests.unit.scan.bench import PIPELINE, failure_code
@@ -100,6 +101,7 @@ def test_second_owner_is_refused_and_leaves_the_first_its_lock(folder: DataFolde
         DataFolder(folder.root)
 
 
+@pytest.mark.slow
 def test_folder_of_a_process_that_was_killed_may_be_taken(tmp_path: Path) -> None:
     code = (
         "import sys, time; from pathlib import Path; from slrig.jobs.data_folder import DataFolder\n"
@@ -266,8 +268,8 @@ def test_start_says_when_the_files_of_a_scan_are_gone(
     assert all(f"{name} is gone" in record.fault.message for name in gone)
 
 
-@pytest.mark.parametrize("name", ["mesh.ply", "report.json", FILES])
-@pytest.mark.parametrize("damage", ["cut", "emptied", "removed", "a folder"])
+@parametrize_core("name", ["mesh.ply", "report.json", FILES])
+@parametrize_core("damage", ["cut", "emptied", "removed", "a folder"], core=[0, 2])
 def test_start_says_which_files_of_a_scan_are_damaged(
     store: JobStore, folder: DataFolder, name: str, damage: str
 ) -> None:

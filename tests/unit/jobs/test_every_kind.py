@@ -248,8 +248,15 @@ def kind(request: pytest.FixtureRequest, service: Service) -> Kind:
     return cast("type[Kind]", request.param)(service)
 
 
+IN_THE_CORE = (Scan, Pose, Solve, Model)
+
+
 def parametrised(kinds: Sequence[type[Kind]]) -> pytest.MarkDecorator:
-    return pytest.mark.parametrize("kind", kinds, indirect=True, ids=[kind.__name__.lower() for kind in kinds])
+    marked = [
+        pytest.param(kind, marks=() if kind in IN_THE_CORE else pytest.mark.slow, id=kind.__name__.lower())
+        for kind in kinds
+    ]
+    return pytest.mark.parametrize("kind", marked, indirect=True)
 
 
 computing = parametrised([kind for kind in KINDS if kind.computes])

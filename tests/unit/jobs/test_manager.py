@@ -37,6 +37,7 @@ from slrig.jobs.resume import resume
 from slrig.jobs.store import JobStore
 from slrig.rig.session import ActiveCalibration, RigSession
 from slrig.rig.watchdog import Watchdog
+from tests.core import parametrize_core
 from tests.unit.jobs.tame_compute import TameCompute
 from tests.unit.jobs.tame_manager import TameManager
 from tests.unit.scan.bench import PIPELINE, Bench, failure_code
@@ -203,7 +204,7 @@ def test_rig_is_used_on_its_owner_thread_and_dark_afterwards(bench: Bench) -> No
     assert len(bench.opened) == 1
 
 
-@pytest.mark.parametrize("raised", [SystemExit(3), KeyboardInterrupt(), RuntimeError("odd \udcff")], ids=repr)
+@parametrize_core("raised", [SystemExit(3), KeyboardInterrupt(), RuntimeError("odd \udcff")], ids=repr)
 def test_the_rig_goes_on_whatever_a_job_raises(bench: Bench, raised: BaseException) -> None:
     work = Steps(capture_error=raised)
     with capture_logs():
@@ -243,7 +244,7 @@ def test_jobs_of_all_kinds_wait_in_one_line(bench: Bench) -> None:
     assert bench.until(running.id).state is JobState.SUCCEEDED
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("error", "words"),
     [
         (DeviceGoneError("Camera 'cam0' was unplugged."), "unplugged"),
@@ -416,7 +417,7 @@ def test_the_rig_is_free_before_the_frames_are_on_the_disk(tame: JobBench) -> No
     assert tame.manager.wait(job_id, WAIT_S).state is JobState.SUCCEEDED
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("work", "state", "fault", "kept"),
     [
         (Steps(capture_error=DeviceGoneError("gone")), JobState.FAILED, "device-gone", []),
@@ -428,6 +429,7 @@ def test_the_rig_is_free_before_the_frames_are_on_the_disk(tame: JobBench) -> No
         (Steps(compute_error=ZeroDivisionError("secret")), JobState.FAILED, "unexpected", ["bundle", FILES]),
         (Steps(outcome=Outcome({"found": 0}, REFUSED)), JobState.FAILED, "pose-refused", None),
     ],
+    core=[0, 2, 4, 6],
 )
 def test_whatever_happens_the_job_has_one_end_with_its_cause(
     tame: JobBench, work: Steps, state: JobState, fault: str, kept: list[str] | None

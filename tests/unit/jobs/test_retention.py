@@ -34,6 +34,7 @@ from slrig.jobs.store import Audit, JobStore, Outbox, RequestKeys
 from slrig.rig.session import RigSession
 from slrig.scan.job import plan_json
 from slrig.scan.plan import ScanPlan
+from tests.core import parametrize_core
 from tests.unit.jobs.tame_compute import TameCompute
 from tests.unit.scan.bench import PIPELINE
 from tests.unit.scan.fakes import never
@@ -91,7 +92,7 @@ def archive(tmp_path: Path) -> Iterator[Scans]:
     found.folder.release()
 
 
-@pytest.mark.parametrize(
+@parametrize_core(
     ("limits", "kept"),
     [
         (Limits(), 5),
@@ -100,6 +101,7 @@ def archive(tmp_path: Path) -> Iterator[Scans]:
         (Limits(size_bytes=3999), 3),
         (Limits(count=4, days=1.0, size_bytes=1000), 1),
     ],
+    core=[1, 3, 4],
 )
 def test_the_oldest_beyond_a_limit_are_removed(archive: Scans, limits: Limits, kept: int) -> None:
     made = [archive.scan() for _ in range(5)]
@@ -133,7 +135,7 @@ def test_those_that_failed_push_out_none_that_succeeded_and_go_first(archive: Sc
 EVERY_LIMIT = Limits(count=9, days=30.0, size_bytes=10**6)
 
 
-@pytest.mark.parametrize("restarts", [False, True])
+@pytest.mark.parametrize("restarts", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("years", [-10, 10])
 def test_a_clock_that_jumps_removes_nothing(archive: Scans, years: int, *, restarts: bool) -> None:
     def look() -> None:
@@ -158,7 +160,7 @@ def test_a_clock_that_jumps_removes_nothing(archive: Scans, years: int, *, resta
     assert archive.store.finished(JobKind.SCAN)[0].id == made[-1]
 
 
-@pytest.mark.parametrize("years", [-10, 10])
+@parametrize_core("years", [-10, 10])
 def test_notices_and_keys_of_requests_outlive_a_clock_that_jumps(archive: Scans, years: int) -> None:
     clock, scan = archive.steady.now, archive.scan()
     outbox = Outbox(archive.store.database, wanted={"webhook": ["job.ended"]}, clock=clock)

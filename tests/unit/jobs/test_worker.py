@@ -142,11 +142,13 @@ def test_killed_process_is_named_and_replaced(worker: Worker, tmp_path: Path) ->
     assert worker.process_id != before
 
 
+@pytest.mark.slow
 def test_process_killed_while_idle_costs_nothing_but_a_new_one(worker: Worker, tmp_path: Path) -> None:
     killed(worker)
     assert worker.run(job(tmp_path, "finish")).summary["seconds"] == 1.5
 
 
+@pytest.mark.slow
 def test_deaf_job_loses_its_process(worker: Worker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker_wait, "CANCEL_LIMIT_S", 0.0)
     told = Told()
@@ -167,6 +169,7 @@ def test_any_function_is_called_and_a_job_knows_where_it_is_computed(worker: Wor
     assert report_in(tmp_path)["computed"] == {"where": "pool"}
 
 
+@pytest.mark.slow
 def test_an_answer_that_came_too_late_is_dropped(worker: Worker, tmp_path: Path) -> None:
     """What was told of progress refused it: the wait is over, the job is not."""
 
@@ -202,6 +205,7 @@ def test_an_answer_of_another_job_is_dropped() -> None:
     process.join()
 
 
+@pytest.mark.slow
 def test_a_process_that_shows_no_sign_of_life_is_replaced(worker: Worker, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker_module, "SILENCE_TOLD_S", 0.0)
     monkeypatch.setattr(worker_wait, "SILENCE_LIMIT_S", 1.5)
@@ -214,6 +218,7 @@ def test_a_process_that_shows_no_sign_of_life_is_replaced(worker: Worker, monkey
     assert worker.run(task("process_id")) != stopped
 
 
+@pytest.mark.slow
 def test_a_job_without_progress_is_taken_for_one_that_never_ends(
     worker: Worker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -252,6 +257,7 @@ def test_jobs_have_their_turn_in_the_order_in_which_they_came(worker: Worker, tm
     assert ended == ["first", "second"]
 
 
+@pytest.mark.slow
 def test_how_far_the_kernels_are_is_told_before_and_during_a_job(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -284,6 +290,7 @@ def test_how_far_the_kernels_are_is_told_before_and_during_a_job(
     fresh.close()
 
 
+@pytest.mark.slow
 def test_process_that_ends_while_it_loads_is_told(tmp_path: Path) -> None:
     broken = Worker("tests.unit.jobs.preparing_pipeline")
     broken.start()
@@ -562,6 +569,7 @@ def test_frames_of_a_capture_that_failed_reach_no_other_scan(worker: Worker, run
     assert run(feed) == [2, 2, True]
 
 
+@pytest.mark.slow
 def test_process_that_is_killed_during_the_capture_costs_the_head_start_only(worker: Worker, run: Ran) -> None:
     feed = worker.feed()
     feed.begin(OUTLINE, CALIBRATION)
@@ -580,6 +588,7 @@ def test_frame_that_cannot_be_used_costs_the_head_start_only(worker: Worker, run
     assert worker.process_id == before
 
 
+@pytest.mark.slow
 def test_cancel_ends_a_process_that_is_stuck_in_a_frame(
     worker: Worker, run: Ran, monkeypatch: pytest.MonkeyPatch
 ) -> None:

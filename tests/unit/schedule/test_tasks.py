@@ -29,6 +29,7 @@ from slrig.failure import JobFailure, error_of
 from slrig.jobs.records import Holder, JobKind, JobState
 from slrig.schedule.scheduler import Tasks
 from slrig.schedule.store import Cron, RunState, Schedule, ScheduledRun, ScheduleSpec, TaskKind
+from tests.core import parametrize_core
 from tests.unit.accept.test_job import PLAN, Desk, desk, desks
 from tests.unit.calibrate.calibration_bench import CalibrationBench
 from tests.unit.calibrate.health_bench import a_verification
@@ -181,6 +182,7 @@ def test_calibration_that_is_not_to_be_used_is_not_activated(bench: TaskBench, m
     assert bench.calibrations.active is None
 
 
+@pytest.mark.slow
 def test_device_or_solve_that_fails_fails_the_run(bench: TaskBench) -> None:
     bench.error = DeviceError("the camera does not answer")
     with pytest.raises(DeviceError, match="the camera does not answer"):
@@ -236,7 +238,7 @@ def test_busy_rig_is_refused_before_anything_is_done(bench: TaskBench) -> None:
     assert len(bench.calibrations.latest()) == before
 
 
-@pytest.mark.parametrize("task", [TaskKind.VERIFICATION, TaskKind.CALIBRATION])
+@parametrize_core("task", [TaskKind.VERIFICATION, TaskKind.CALIBRATION])
 def test_run_holds_the_rig_in_the_name_of_its_schedule_until_it_is_cancelled(bench: TaskBench, task: TaskKind) -> None:
     bench.use_a_calibration()
     schedule, _ = scheduled(task, {})
@@ -265,6 +267,7 @@ def test_run_holds_the_rig_in_the_name_of_its_schedule_until_it_is_cancelled(ben
     assert bench.until(bench.scan(wait=True).id).state is JobState.SUCCEEDED
 
 
+@pytest.mark.slow
 def test_acceptance_is_measured_by_script_and_gives_its_decision(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(AcceptanceRequest, "plan", lambda *_: PLAN)
     schedule, run = scheduled(TaskKind.ACCEPTANCE, {})

@@ -148,6 +148,7 @@ print(camera.configure(CameraSettings(0.005)).exposure_s)
 """
 
 
+@pytest.mark.slow
 def test_a_program_that_leaves_a_camera_open_ends() -> None:
     ended = subprocess.run(  # noqa: S603 - this interpreter, on a text of ours
         [sys.executable, "-c", LEAVES_IT_OPEN], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False

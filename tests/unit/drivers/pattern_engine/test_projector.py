@@ -231,8 +231,12 @@ CHECK = {"check_begins": 0.009, "check": 0.3}
 
 @pytest.mark.parametrize(
     ("made", "late"),
-    [(kind, late) for kind in ("dlpc350", "dlpc900") for late in (*LATE, ChainMap(*LATE))]
-    + [("dlpc350", CHECK), ("dlpc350", ChainMap(CHECK, *LATE))],
+    [
+        ("dlpc350", ChainMap(CHECK, *LATE)),
+        ("dlpc900", ChainMap(*LATE)),
+        *(pytest.param("dlpc350", late, marks=pytest.mark.slow) for late in (*LATE, CHECK)),
+        *(pytest.param("dlpc900", late, marks=pytest.mark.slow) for late in LATE),
+    ],
     indirect=["made"],
 )
 def test_an_engine_that_takes_its_time_opens_shows_and_plays(made: MakesBench, late: Mapping[str, float]) -> None:
