@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from slrig.kernels import in_bands
 from slrig.model import FloatArray, IntArray, NoiseModel, Refusal, coarse_bit_count
@@ -34,6 +35,7 @@ from slrig.reconstruction.stripes import (
     LinePoints,
     StripeLimits,
     edge_points,
+    edge_skew_px,
     normalise,
     normalise_kernel,
     normalise_line,
@@ -49,6 +51,12 @@ _CROSS = np.array([(0, 1, 0), (1, 1, 1), (0, 1, 0)], np.uint8)
 _SIDES_PX = 7  # both sides of an edge of the code, which blur and filter spread over some 3 px each way
 _AROUND_PX = 17  # light from other surfaces is alike so far
 _MIN_EDGE_SWING = 0.5  # of a contrast that is twice 1; with less, the levels are uncertain
+_BLOCK_PX, _BLOCKS_AROUND = 32, 9  # of the image; along each side, over which skew is averaged
+_MIN_POINTS = 100  # of edges there
+_CORRELATED_POINTS = 5  # whose errors a filter correlates along the stripe
+_SIGNIFICANT = 4.0  # standard deviations of a mean
+_SKEW = 1.4  # over the first order, of light that falls off exponentially to one side
+_MIN_SKEW_PX, _MAX_SKEW_PX = 0.01, 2.0  # less is within what is stated, more is no edge by itself
 _CLIPPED_SHIFT = 1.5  # over the shift by the smoothed second derivative, which is smaller than that of the light
 
 
@@ -206,7 +214,7 @@ def code_edge_points(
     """
     frames, lit = decoded.frames, decoded.search_mask
     surfaces_light_each_other = _surfaces_light_each_other(decoded)
-    parts = []
+    parts, skew = [], [np.zeros((0, 2))]
     # A flank that is cut off at full scale is not like the other one.
     reach = 2 * int(np.ceil(3 * scale_px)) + 1
     near_clipped = cv2.dilate((frames.white >= frames.clipped_at).view(np.uint8), np.ones((reach, reach), np.uint8)) > 0
@@ -221,7 +229,40 @@ def code_edge_points(
         points = edge_points(light, deviation, read, limits, filter_px=scale_px)
         shift_px = _CLIPPED_SHIFT * smoothing_shift_px(light, points, near_clipped, scale_px)
         parts.append(points._replace(sigma_px=np.hypot(points.sigma_px, shift_px)))
+        if index < coarse_bit_count(len(frames.bits)):
+            skew.append(edge_skew_px(light, points, scale_px)[:, None] * points.normals)
+    skewed_px = _block_skew(np.concatenate([each.points_px for each in parts[: len(skew) - 1]] or [np.zeros((0, 2))]),
+                            np.concatenate(skew), lit.shape)  # fmt: skip
+    for each in parts:
+        column, row = np.rint(each.points_px).astype(np.intp).T // _BLOCK_PX
+        across = np.einsum("ij,ij->i", skewed_px[row, column], each.normals)
+        np.hypot(each.sigma_px, across, out=each.sigma_px)
     return parts
+
+
+def _block_skew(points_px: FloatArray, skew_px: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+    """(rows, columns, 2) px: of each block of the image, the mean (n, 2) of what noise and prints do not explain.
+
+    Light that spreads to one side (a translucent object, coma) displaces code edges and other patterns differently;
+    which of them is right is not known.
+    """
+    rows, columns = (length // _BLOCK_PX + 1 for length in shape)
+    known = (np.abs(skew_px) < _MAX_SKEW_PX).all(axis=1)  # False for NaN
+    column, row = np.rint(points_px[known]).astype(np.intp).T // _BLOCK_PX
+    block = row * columns + column
+
+    def around(values: FloatArray | None) -> FloatArray:
+        total = np.bincount(block, values, rows * columns).reshape(rows, columns).astype(np.float64)
+        return np.asarray(uniform_filter(total, _BLOCKS_AROUND, mode="constant") * _BLOCKS_AROUND**2)
+
+    count = np.maximum(around(None), 1e-9)
+    skewed = np.zeros((rows, columns, 2))
+    for each in range(2):
+        mean = around(skew_px[known, each]) / count
+        variance = np.maximum(around(skew_px[known, each] ** 2) / count - mean**2, 0) * _CORRELATED_POINTS / count
+        shown = (mean**2 > _SIGNIFICANT**2 * variance) & (np.abs(mean) > _MIN_SKEW_PX) & (count > _MIN_POINTS)
+        skewed[..., each] = np.where(shown, _SKEW * mean, 0)
+    return skewed
 
 
 def light_from_surfaces(decoded: DecodedImage) -> tuple[float, float]:

@@ -18,7 +18,7 @@ then triangulated (`triangulation`), merged (`merging`) and given standard devia
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from slrig.errors import PatternError
 from slrig.model import FloatArray, IntArray, NoiseModel, Pattern, Refusal
+from slrig.reconstruction.bit_agreement import bit_agreement
 from slrig.reconstruction.blur import correct_curvature, estimate_blur
 from slrig.reconstruction.camera_response import (
     CameraResponse,
@@ -98,6 +99,7 @@ class CameraCurves:
 
     refusal : (H, W) uint8, `Refusal`; stripe_points, stripe_count : before linking. refined : True if the points are
     those of `refinement.refine_points`; disagreement_px : as in `refinement.Refinement`, empty without phase.
+    bits_displaced_px : as in `bit_agreement.BitAgreement`, empty where all points are of lines.
     unresolved : (H, W) uint8, number of finest bits left out at each pixel; None where bits only number lines.
     unresolved_lines : (H, W) bool, where code edges replace lines that the camera does not resolve; None if nowhere.
     compression_dn : standard deviation of white noise that displaces positions as much as the loss by compression; 0
@@ -131,6 +133,7 @@ class CameraCurves:
     clipped_code: int = 0
     sample_step: float = 1.0
     full_scale: float = 0.0
+    bits_displaced_px: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 def camera_curves(
@@ -464,7 +467,7 @@ def _refine_identify_link(
     """
     frames, from_surfaces = image.frames, light_from_surfaces(image)
     beyond = cells_beyond(frames, image.code, tables.index_of_word)
-    cell_count = len(tables.cell_position)
+    cell_count, bit_count = len(tables.cell_position), len(frames.bits)
     if frames.sine_patterns:
         cell_count = code_cell_count(frames.gray, tables.extent_px)
     clipped_white, clipped_code = _count_clipped(frames, ~image.unlit)
@@ -510,6 +513,10 @@ def _refine_identify_link(
         )  # fmt: skip
     points.clear()
     stacks.release()
+    bits_displaced_px = np.zeros(0)
+    if without_lines is not None or not (frames.line_patterns or frames.sine_patterns):
+        bits_displaced_px, sigma_px = bit_agreement(numbered, bit_count, frames.gray.cell_px)
+        np.hypot(numbered.stripes.sigma_px, sigma_px, out=numbered.stripes.sigma_px)
     decoded = image.code.refusal == Refusal.NONE
     if image.region is not None:
         decoded &= image.region
@@ -525,6 +532,7 @@ def _refine_identify_link(
         stripe_count=len(numbered.stripes),
         refined=aligned.refined,
         disagreement_px=aligned.disagreement_px,
+        bits_displaced_px=bits_displaced_px,
         unresolved=image.unresolved,
         unresolved_lines=without_lines,
         compression_dn=float(np.sqrt(image.response.loss_variance)),

@@ -5,7 +5,8 @@ The σ of a vertex consists of, added in squares:
 1. noise of the pixels (`camera_response.estimate_noise`, with correlation and compression), over the gradient of the
    position (`surface_fit`), or the filter's own σ (`stripes`), joined by `refinement`;
 2. mixed light near depth steps (`phase.step_sigma_px`), brightness gradients (`phase.centroid_residual_px`), and
-   light from other surfaces that makes lines asymmetric (`phase.asymmetry_sigma_px`);
+   light from other surfaces that makes lines asymmetric (`phase.asymmetry_sigma_px`); of code edges, light that spreads
+   to one side (`decoded_image.code_edge_points`), and bits that contradict one another (`bit_agreement`);
 3. both moved through the triangulation, which gives millimetres (`triangulation`, fused by `merging`), and projected
    onto the normal (`sigma_along_normal`);
 4. the calibration's covariance, if it states one (`calibration_sigma`);

@@ -97,6 +97,7 @@ def camera_report(curves: CameraCurves, exposures: Sequence[ExposureUse] = ()) -
         "bridges": int(curves.ensemble.bridge_after.sum()),
         "refined_by_all_lines": curves.refined,
         "frame_disagreement_px": curves.disagreement_px.tolist(),
+        "bits_displaced_px": curves.bits_displaced_px.tolist(),
     }
 
 
