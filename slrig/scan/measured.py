@@ -413,9 +413,9 @@ def camera_notes(cameras: Sequence[CameraResult]) -> list[str]:
         if camera.curves.bits_displaced_px.any():
             notes.append(
                 f"camera '{camera.name}': edges of the code's finest bits lie up to "
-                f"{camera.curves.bits_displaced_px.max():.2f} px (median where they do) beside those of the others, and "
-                "σ contains this. Light spreads to one side (a translucent object, a decentred lens), "
-                "or something moved between two frames. What displaces all bits alike does not show: play shifted "
+                f"{camera.curves.bits_displaced_px.max():.2f} px (median where they do) beside those of the others, "
+                "and σ contains this. Light spreads to one side (a translucent object, a decentred lens), or something "
+                "moved between two frames. What displaces all bits alike does not show: play shifted "
                 "lines or sinusoids, too, wider cells, or both axes"
             )
         if camera.curves.compression_dn > 0:
