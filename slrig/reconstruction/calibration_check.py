@@ -359,7 +359,9 @@ class CalibrationCheck:
             _REFUTED_PX if self.explained else min(_REFUTED_PX, max(self.limit_px, _REFUTED_SIGMA * self.sigma_px))
         )
         # Residuals that real lenses leave may imply any error where light sheets hardly cross the baseline.
-        is_large = self.systematic_px > _MAX_SYSTEMATIC_PX or self.median_px > 2 * self.sigma_px
+        is_large = self.systematic_px > _MAX_SYSTEMATIC_PX or self.median_px > 2 * max(
+            self.sigma_px, _MAX_SYSTEMATIC_PX
+        )
         implied_px = self.coded_error_px if is_large else 0.0
         return bool(self.cause) or not max(self.median_px, implied_px) <= limit_px
 

@@ -343,3 +343,15 @@ def test_two_cameras_refute_a_wrong_calibration_and_name_its_mistake(
     assert found.is_refuted
     assert words in found.cause
     assert "projector" not in found.cause
+
+
+def test_a_residual_of_a_tenth_of_a_pixel_refutes_nothing(pairs: PixelPairs) -> None:
+    """However much it means for the columns: clipped frames displace edges by so much."""
+    found = checked((CAMERA, turned(PROJECTOR, (0, 0.1, 0)), pairs))
+    assert found.fit is not None
+    implied = replace(found.fit, coded_error_px=6.0, coded_sigma_px=0.6, is_significant=True)
+
+    small = replace(found, median_px=0.1, systematic_px=0.02, sigma_px=0.036, fit=implied, cause="")
+
+    assert not small.is_refuted
+    assert replace(small, systematic_px=0.2).is_refuted
