@@ -270,7 +270,7 @@ class LightMeasurement:
         return replace(
             self,
             exposure_s=exposure_s,
-            shortest_s=self.levels.shortest_exposure_s(exposure_s),
+            shortest_s=_shortest_s((self.own_exposure_s, self.own_levels), (exposure_s, self.levels)),
             longest_s=self.levels.longest_exposure_s(exposure_s),
             taken_s=taken_s,
         )
@@ -326,7 +326,7 @@ def measure_light(
         own_levels=own_levels,
         exposure_s=exposure_s,
         levels=levels,
-        shortest_s=levels.shortest_exposure_s(exposure_s),
+        shortest_s=_shortest_s((own_s, own_levels), (exposure_s, levels)),
         longest_s=levels.longest_exposure_s(exposure_s),
         skew_s=frame.shutter_skew_s,
         stamp_error_s=frame.t_err_ns / 1e9,
@@ -360,6 +360,11 @@ def _measure_levels(session: CameraSession, sequence: PatternSequence, exposure_
 
 def _is_visible(levels: LightLevels) -> bool:
     return levels.lit_share >= _MIN_LIT_SHARE
+
+
+def _shortest_s(*looks: tuple[float, LightLevels]) -> float:
+    """Shortest exposure with MIN_SNR, s, by looks at several exposures: each that shows the light is an upper limit."""
+    return min(levels.shortest_exposure_s(exposure_s) for exposure_s, levels in looks if _is_visible(levels))
 
 
 def _next_exposure_s(exposure_s: float, levels: LightLevels) -> float:

@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from slrig.jobs.data_folder import write_entries
 from slrig.scan.artefacts import encode_mesh_ply
 from tests.e2e.conftest import Start, browser, scanned, write_rig
 from tests.e2e.page.conftest import Visit, visit
@@ -40,7 +41,9 @@ def test_a_large_mesh_shows_at_once_and_whole_soon(start: Start, tmp_path: Path,
     with service.client() as client:
         scan = scanned(client)["links"]["self"]
     mesh = sheet(ROWS, COLUMNS)
-    (service.data / "scans" / scan.rpartition("/")[2] / "mesh.ply").write_bytes(encode_mesh_ply(mesh))
+    results = service.data / "scans" / scan.rpartition("/")[2]
+    (results / "mesh.ply").write_bytes(encode_mesh_ply(mesh))
+    write_entries(results)
     seconds = []
     for _ in range(2):
         begun = time.monotonic()

@@ -285,6 +285,13 @@ def measurement(own_exposure_s: float, *, shortest_s: float = 0.002, longest_s: 
     return LightMeasurement("left", own_exposure_s, levels(), 0.02, levels(), shortest_s, longest_s, 0.0)
 
 
+def test_each_exposure_that_was_tried_limits_the_shortest() -> None:
+    # Noise that grows with the light makes the limit of a longer one too long.
+    short = measurement(0.001).limited(1.0)
+    assert short.shortest_s == pytest.approx(levels().shortest_exposure_s(0.001))
+    assert measurement(0.5).limited(1.0).shortest_s == pytest.approx(levels().shortest_exposure_s(0.02))
+
+
 LIMITS_S = (1e-5, 1.0)
 MAINS = LightFlicker("room", 100.0, 0.05)
 WHEEL = LightFlicker("projector", 180.0, 0.4)
