@@ -162,12 +162,16 @@ def serving(rig: Path, data: Path, **settings: Any) -> Iterator[ServiceProcess]:
 
 
 def python(
-    *words: object, codes: Container[int] = (0,), folder: Path | None = None, **settings: str
+    *words: object,
+    codes: Container[int] = (0,),
+    folder: Path | None = None,
+    timeout_s: float = 300.0,
+    **settings: str,
 ) -> subprocess.CompletedProcess[str]:
     """Run a program as a person does, in `folder`. codes : its exit codes that are right."""
     command, environment = [sys.executable, *map(str, words)], {**os.environ, **settings}
     done = subprocess.run(  # noqa: S603 - our own programs
-        command, capture_output=True, text=True, timeout=300, check=False, env=environment, cwd=folder
+        command, capture_output=True, text=True, timeout=timeout_s, check=False, env=environment, cwd=folder
     )
     assert done.returncode in codes, done.stdout + done.stderr
     return done
