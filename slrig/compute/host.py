@@ -46,9 +46,9 @@ from slrig.config import is_loopback, read_private_text
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError, ScanCancelledError, WorkerLostError
 from slrig.failure import JobFailure, job_failure
-from slrig.jobs.database import versions
 from slrig.jobs.job import JobRun
 from slrig.jobs.listener import Listener
+from slrig.jobs.records import versions
 from slrig.jobs.worker import POLL_S, READY, Compute, Task, Worker, job_task, prepare_kernel_cache
 from slrig.scan.job import PIPELINE, ScanJob
 from slrig.scan.plan import ScanPlan

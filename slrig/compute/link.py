@@ -56,7 +56,7 @@ JobKey = Annotated[str, Field(pattern="^[0-9a-f]{32}$")]
 """A job of a pool: a random number, which is part of names in the store."""
 
 Versions = dict[str, str]
-"""See `slrig.jobs.database.versions`."""
+"""See `slrig.jobs.records.versions`."""
 
 
 class Hello(Message):

@@ -42,9 +42,9 @@ from slrig.config import ServiceSettings
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError, StorageError
 from slrig.jobs.data_folder import BUNDLE, RESULT
-from slrig.jobs.database import versions
 from slrig.jobs.job import FrameFeed
 from slrig.jobs.listener import SILENT, Listener
+from slrig.jobs.records import versions
 from slrig.jobs.worker import POLL_S, Compute, JobFiles, Task, Worker
 from slrig.model import Region
 from slrig.scan.job import ScanJob

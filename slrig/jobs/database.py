@@ -6,17 +6,13 @@ taken over.
 
 from __future__ import annotations
 
-import hashlib
-import platform
 import random
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime
-from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 from uuid import UUID, uuid4
@@ -47,9 +43,9 @@ from sqlalchemy.exc import DatabaseError, OperationalError
 from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column
 
 from slrig.bundle import stored_json
-from slrig.errors import DamagedError, InvalidInputError, StorageError
+from slrig.errors import InvalidInputError, StorageError
 from slrig.failure import JobFailure, disk_errors
-from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState
+from slrig.jobs.records import UNREADABLE, JobKind, JobProgress, JobRecord, JobState
 
 
 class Base(DeclarativeBase):
@@ -239,13 +235,6 @@ _log = structlog.get_logger(__name__)
 
 _Row = TypeVar("_Row", bound=Base)
 _Read = TypeVar("_Read")
-
-UNREADABLE = JobFailure(
-    DamagedError.code,
-    "The record of this job is damaged, and cannot be read. Look after the disk. Where its files are whole, the next "
-    "start of the service makes the record anew of them; if not, delete the job.",
-)
-"""The fault of a job whose row cannot be read."""
 
 
 class _UnreadableJson(dict[str, Any]):
@@ -550,25 +539,3 @@ def upgrade(connection: Connection, scripts: str, tables: MetaData) -> str:
     if not unknown:
         command.upgrade(config, "head")
     return ", ".join(sorted(unknown))
-
-
-_LIBRARIES = ("slrig", "numpy", "numba", "llvmlite", "scipy", "opencv-python-headless")
-_PACKAGE = Path(__file__).resolve().parent.parent
-
-
-@cache
-def versions() -> Mapping[str, str]:
-    """By name: of slrig and the libraries that it computes with, `code`, a hash of slrig's own files, which tells two
-    states of one version apart, and `machine`, the kind of processor. Where all are equal, so are the bytes of a mesh.
-    """
-    code = hashlib.sha256()
-    for path in sorted(_PACKAGE.rglob("*.py")):
-        code.update(path.relative_to(_PACKAGE).as_posix().encode())
-        code.update(path.read_bytes())
-    found = {name: version(name) for name in _LIBRARIES}
-    return {**found, "code": code.hexdigest()[:16], "machine": platform.machine()}
-
-
-def computed(where: Mapping[str, str]) -> dict[str, object]:
-    """The section `computed` of a report: `Task.where`, the machine's name, and `versions`."""
-    return {**where, "host": platform.node(), "versions": dict(versions())}

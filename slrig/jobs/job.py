@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 from uuid import UUID
 
 import structlog
@@ -20,12 +20,14 @@ from slrig.capture import EvidenceSummary
 from slrig.errors import DamagedError, StorageError
 from slrig.failure import JobFailure
 from slrig.jobs.data_folder import BUNDLE, RESULT, DataFolder
-from slrig.jobs.database import UNREADABLE
 from slrig.jobs.listener import Listener
-from slrig.jobs.records import JobKind, JobProgress, JobRecord
-from slrig.jobs.store import JobStore
+from slrig.jobs.records import UNREADABLE, JobKind, JobProgress, JobRecord
 from slrig.model import Calibration, CaptureHeader, Region, Shot
 from slrig.rig.session import RigSession
+
+if TYPE_CHECKING:
+    # Not for the reconstruction process, which has no database.
+    from slrig.jobs.store import JobStore
 
 LEAST_WAITING_BYTES, MOST_WAITING_BYTES = 128 * 2**20, 512 * 2**20
 """How much of frames may wait for the reconstruction: a whole scan of a common camera where there is little memory, and

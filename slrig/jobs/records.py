@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
+import platform
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
+from functools import cache
+from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -16,7 +20,7 @@ from uuid import UUID
 from pydantic import TypeAdapter, ValidationError
 
 from slrig.bundle import write_file
-from slrig.errors import QueueFullError
+from slrig.errors import DamagedError, QueueFullError
 from slrig.failure import JobFailure
 
 RECORD = "record.json"
@@ -324,3 +328,32 @@ def stages_of(record: JobRecord, events: Sequence[JobEvent]) -> Iterator[Stage]:
 
 def _is_state(event: JobEvent) -> bool:
     return event.kind == "state" and "time" in event.data
+
+
+UNREADABLE = JobFailure(
+    DamagedError.code,
+    "The record of this job is damaged, and cannot be read. Look after the disk. Where its files are whole, the next "
+    "start of the service makes the record anew of them; if not, delete the job.",
+)
+"""The fault of a job whose row cannot be read."""
+
+_LIBRARIES = ("slrig", "numpy", "numba", "llvmlite", "scipy", "opencv-python-headless")
+_PACKAGE = Path(__file__).resolve().parent.parent
+
+
+@cache
+def versions() -> Mapping[str, str]:
+    """By name: of slrig and the libraries that it computes with, `code`, a hash of slrig's own files, which tells two
+    states of one version apart, and `machine`, the kind of processor. Where all are equal, so are the bytes of a mesh.
+    """
+    code = hashlib.sha256()
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        code.update(path.relative_to(_PACKAGE).as_posix().encode())
+        code.update(path.read_bytes())
+    found = {name: version(name) for name in _LIBRARIES}
+    return {**found, "code": code.hexdigest()[:16], "machine": platform.machine()}
+
+
+def computed(where: Mapping[str, str]) -> dict[str, object]:
+    """The section `computed` of a report: `Task.where`, the machine's name, and `versions`."""
+    return {**where, "host": platform.node(), "versions": dict(versions())}

@@ -20,7 +20,6 @@ from slrig.config import NoticeKind
 from slrig.errors import DamagedError, IdempotencyError, JobNotFoundError, KeyInFlightError
 from slrig.failure import JobFailure
 from slrig.jobs.database import (
-    UNREADABLE,
     AuditRow,
     CopyRow,
     Database,
@@ -34,6 +33,7 @@ from slrig.jobs.database import (
 )
 from slrig.jobs.records import (
     RIG_JOBS,
+    UNREADABLE,
     Clock,
     JobEvent,
     JobKind,

@@ -20,8 +20,8 @@ from slrig.bundle import read_capture, read_health, read_notes, read_truth, read
 from slrig.capture import EvidenceSummary
 from slrig.disk import storage_errors
 from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, setting
-from slrig.jobs.database import computed
 from slrig.jobs.listener import SILENT, Listener
+from slrig.jobs.records import computed
 from slrig.kernels import KernelCount, report_compilations, trim_malloc
 from slrig.meshing import (
     MeshingLimits,

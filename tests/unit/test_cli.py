@@ -107,6 +107,12 @@ def test_help_and_version_load_nothing_heavy() -> None:
     assert printed(code) == "[]"
 
 
+def test_the_reconstruction_loads_no_database() -> None:
+    heavy = {"sqlalchemy", "alembic", "fastapi"}
+    code = f"import sys, slrig.jobs.worker, slrig.scan.reconstruct\nprint(sorted({heavy} & set(sys.modules)))"
+    assert printed(code) == "[]"
+
+
 def test_shell_completes_commands() -> None:
     words = {"_SLRIG_COMPLETE": "complete_bash", "COMP_WORDS": "slrig sc", "COMP_CWORD": "1"}
     found = subprocess.run(

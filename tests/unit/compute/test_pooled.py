@@ -42,9 +42,9 @@ from slrig.errors import (
     WorkerLostError,
 )
 from slrig.jobs.data_folder import RESULT
-from slrig.jobs.database import versions
 from slrig.jobs.job import FrameFeed, JobRun, Outcome
 from slrig.jobs.listener import SILENT, Listener
+from slrig.jobs.records import versions
 from slrig.jobs.worker import READY, Task
 from slrig.model import Region
 from slrig.scan.plan import ScanPlan

@@ -17,10 +17,10 @@ from sqlalchemy import create_engine, text
 
 from slrig.errors import IdempotencyError, JobNotFoundError, KeyInFlightError, StorageError
 from slrig.failure import JobFailure
-from slrig.jobs import database as module
-from slrig.jobs.database import UNREADABLE, Base, Database, sqlite_engine
+from slrig.jobs import records as module
+from slrig.jobs.database import Base, Database, sqlite_engine
 from slrig.jobs.job import ProgressRecorder
-from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState, Stage, stages_of
+from slrig.jobs.records import UNREADABLE, JobKind, JobProgress, JobRecord, JobState, Stage, stages_of
 from slrig.jobs.store import KEPT_PROGRESS, JobStore, RequestKeys
 from slrig.scan.job import plan_from_json, plan_json
 from slrig.scan.plan import PatternPlan, PresetUse, ScanPlan

@@ -36,8 +36,8 @@ from slrig.errors import (
     ScanCancelledError,
     SlrigError,
 )
-from slrig.jobs.database import versions
 from slrig.jobs.listener import Listener
+from slrig.jobs.records import versions
 from slrig.model import (
     Axis,
     Black,
