@@ -17,11 +17,11 @@ def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit:
     # In real time, so that there is something to see of the progress.
     service = start(write_rig(tmp_path / "rig", head=SLOW))
     page = visit(service, key=None, ignored="401")
-    page.get_by_label("Key").fill("not the key")
+    page.get_by_label("Key", exact=True).fill("not the key")
     page.get_by_role("button", name="Enter").click()
     page.get_by_role("alert").get_by_text("Unknown API key.").wait_for()
     assert violations(page) == []
-    page.get_by_label("Key").fill(KEY)
+    page.get_by_label("Key", exact=True).fill(KEY)
     page.keyboard.press("Enter")
     page.get_by_text("No scans yet.").wait_for()
     page.get_by_text("ready").wait_for()
@@ -108,5 +108,5 @@ def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit:
     page.get_by_text("triangles, σ").wait_for()
     looks_as_kept(page, "scan-phone-dark")
     page.get_by_role("button", name="Log out").click()
-    page.get_by_label("Key").wait_for()
+    page.get_by_label("Key", exact=True).wait_for()
     assert page.evaluate("fetch('/scan').then((answer) => answer.status)") == 401

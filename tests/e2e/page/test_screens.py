@@ -371,7 +371,7 @@ def test_a_camera_is_unplugged_and_a_key_expires(start: Start, tmp_path: Path, v
     keys.write_text(json.dumps(kept))
     page.get_by_role("alert").get_by_text("Your session is over").wait_for()
     assert violations(page) == []
-    page.get_by_label("Key").fill(secret)
+    page.get_by_label("Key", exact=True).fill(secret)
     page.get_by_role("button", name="Enter").click()
     page.get_by_role("alert").get_by_text("This API key expired on").wait_for()
     page.get_by_label("Key", exact=True).fill(KEY)
