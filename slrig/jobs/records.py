@@ -332,8 +332,8 @@ def _is_state(event: JobEvent) -> bool:
 
 UNREADABLE = JobFailure(
     DamagedError.code,
-    "The record of this job is damaged, and cannot be read. Look after the disk. Where its files are whole, the next "
-    "start of the service makes the record anew of them; if not, delete the job.",
+    "The record of this job is damaged and cannot be read. Check the disk. If the job's files are whole, the service "
+    "rebuilds the record from them at its next start; if not, delete the job.",
 )
 """The fault of a job whose row cannot be read."""
 

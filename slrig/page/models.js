@@ -1,7 +1,7 @@
 // Models: scans of one object from several sides, shot on a turntable or by hand, or chosen, and the one mesh that is made of them.
 import {Downloads} from "./downloads.js";
-import {Live} from "./live.js";
 import {Keeping} from "./keeping.js";
+import {Live} from "./live.js";
 import {Mesh, loadDrawing} from "./mesh.js";
 import {NameHeading} from "./names.js";
 import {ask, follow, once, useAction, useValue} from "./service.js";
