@@ -186,7 +186,7 @@ async def look_through_camera(
         ),
     ] = None,
 ) -> Response:
-    """Look through a camera while nobody scans: an `img` element shows it. A scan that comes goes first."""
+    """Look through a camera: an `img` element shows it. Scans go first; pictures wait while one holds the rig."""
     held.enter_context(service.streams.take())
     watch = await run_in_threadpool(service.manager.watch, camera, light, exposure_s)
     return StreamingResponse(

@@ -380,14 +380,13 @@ class JobManager:
         _log.info("job deleted", kind=str(record.kind), job=str(job_id))
 
     def watch(self, camera: str, light: Light, exposure_s: float | None = None) -> Watch:
-        """Look through a camera; pictures come while the rig is idle. exposure_s : see `Previews.watch`.
+        """Look through a camera; pictures come while the rig is idle, and wait while it is held. exposure_s : see
+        `Previews.watch`.
 
         Raises
         ------
         CameraNotFoundError
             The rig has no camera of that name.
-        RigBusyError
-            The rig is held.
         DeviceError
             The rig is not open, or not yet.
         """
@@ -405,8 +404,6 @@ class JobManager:
         with self._changed:
             if self._ending:
                 raise interruption_error()
-            if self._active is not None:
-                raise _busy(self._active)
         return self._previews.watch(camera, light, exposure_s)
 
     def status(self) -> RigStatus:

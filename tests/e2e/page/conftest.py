@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +47,7 @@ def visit(browser: Browser) -> Iterator[Visit]:
         page = context.new_page()
 
         def note(what: str) -> None:
-            if ignored is None or ignored not in what:
+            if ignored is None or not re.search(ignored, what):
                 complaints.append(what)
 
         def heard(message: ConsoleMessage) -> None:

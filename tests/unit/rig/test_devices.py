@@ -37,7 +37,6 @@ from slrig.errors import (
     DeviceStateError,
     DriverBrokenError,
     FrameTimeoutError,
-    RigBusyError,
     SlrigError,
     StorageError,
     UnsupportedByDeviceError,
@@ -670,7 +669,7 @@ def test_no_picture_comes_while_nobody_takes_any() -> None:
 
 
 def test_a_scan_goes_first_and_pictures_go_on_after_it(tmp_path: Path) -> None:
-    """On the runner: looking is refused while a scan holds the rig, and yields to one that comes."""
+    """By the job manager: pictures wait while a scan holds the rig, whether asked for before or during it."""
     bench = Bench(tmp_path)
     # The tame capture asks nothing of these cameras, and lights the tame projector.
     rig = replace(fake_rig().rig, projector=TameProjector(), calibration=tame_calibration())
@@ -683,13 +682,14 @@ def test_a_scan_goes_first_and_pictures_go_on_after_it(tmp_path: Path) -> None:
         with bench.manager.watch("left", Light.OFF) as watch:
             seen = next_of(watch).number
             held = bench.held()
-            with pytest.raises(RigBusyError, match=str(held.id)):
-                bench.manager.watch("left", Light.OFF)
-            stood = next_of(watch).number
-            assert watch.picture(stood, 0.0) is None
-            bench.gate.set()
-            bench.until(held.id)
-            assert next_of(watch, max(seen, stood)).number > stood
+            with bench.manager.watch("left", Light.OFF) as late:
+                stood = next_of(watch).number
+                assert watch.picture(stood, 0.0) is None
+                assert late.picture(stood, 0.0) is None
+                bench.gate.set()
+                bench.until(held.id)
+                assert next_of(watch, max(seen, stood)).number > stood
+                assert next_of(late, stood).number > stood
     finally:
         bench.close()
 
