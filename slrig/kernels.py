@@ -1,6 +1,9 @@
 """Compiled kernels: compilation, cache, count, and execution on all cores.
 
-numba compiles a kernel on its first call, and keeps it on disk. A kernel runs on one core and releases the
+numba compiles a kernel on its first call, and keeps it on disk. A wheel for one platform brings kernels along
+(config/deploy/wheel.py makes it): an archive for each of two levels of x86-64, whose members are named as the files of
+the cache are, by all that went into them. All kernels are compiled for the level of the processor, not for its model,
+so that one machine's kernels run on others. A kernel runs on one core and releases the
 interpreter's lock; `in_bands` calls one for bands of rows on all cores at once. numba's own parallel loops are not
 used: they take three to four times as long to compile, do not compile everywhere (numba 0.68 on Python 3.12 and 3.13
 fails at sums over nested loops), and the threads of GNU OpenMP busy-wait.
@@ -14,15 +17,23 @@ import glob
 import hashlib
 import os
 import pickle
+import platform
 import sys
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from types import CodeType
 from typing import Any, NamedTuple
 
+import llvmlite
+import llvmlite.binding
+import numba
+import numpy as np
 import structlog
 from numba import config, njit
 from numba.core import event
@@ -33,9 +44,52 @@ _BANDS_PER_CORE = 4  # rows take different times; with four bands the last core 
 _MUCH_BYTES = 2**30
 """A scan of 1.3 megapixels holds two thirds of it; below, taking memory again costs more than is saved."""
 _STATM = Path("/proc/self/statm")
+_SHIPPED = Path(__file__).with_name("compiled")
+_V2 = {"cx16", "popcnt", "sahf", "sse3", "sse4.1", "sse4.2", "ssse3"}
+_V3 = _V2 | {"avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave"}
+CPU_LEVELS = {"x86-64-v3": _V3, "x86-64-v2": _V2}
+"""Levels of the x86-64 psABI for which kernels are shipped, best first, and the features that LLVM names for each."""
 
 _log = structlog.get_logger(__name__)
 _kernels: list[tuple[Dispatcher, bool]] = []
+
+
+def best_cpu_level() -> str | None:
+    """Name by which LLVM knows the level of this processor: of x86-64 or, on aarch64, "generic"; None for others."""
+    if platform.machine() == "aarch64":
+        return "generic"
+    features = llvmlite.binding.get_host_cpu_features()
+    has = {name for name, there in features.items() if there}
+    return next((level for level, needed in CPU_LEVELS.items() if needed <= has), None)
+
+
+def _choose_cpu_level() -> None:
+    """Have numba compile for the level, unless NUMBA_CPU_NAME says otherwise. In the environment, because numba reads
+    that again when another of its variables changes; child processes inherit it.
+    """
+    level = best_cpu_level()
+    if level is not None and "NUMBA_CPU_NAME" not in os.environ:
+        os.environ.update(NUMBA_CPU_NAME=level, NUMBA_CPU_FEATURES="")
+        config.reload_config()
+
+
+_choose_cpu_level()
+
+
+def shipped_archive_name() -> str:
+    """Name of the archive of the kernels that fit here: by Python, numba, llvmlite and the CPU compiled for."""
+    versions = f"numba-{numba.__version__}-llvmlite-{llvmlite.__version__}"
+    return f"{sys.implementation.cache_tag}-{versions}-{config.CPU_NAME or 'this-processor'}.zip"
+
+
+def why_compiled() -> str | None:
+    """Return why kernels are compiled here and none are taken from the wheel; None if an archive fits."""
+    there = sorted(each.name for each in _SHIPPED.glob("*.zip"))
+    if shipped_archive_name() in there:
+        return None
+    if not there:
+        return "slrig was installed without compiled kernels"
+    return f"the compiled kernels that came with slrig are {', '.join(there)}; {shipped_archive_name()} would fit"
 
 
 def kernel(function: Callable[..., Any] | None = None, /, *, in_every_scan: bool = True, **options: Any) -> Any:
@@ -84,6 +138,11 @@ def are_all_cached() -> bool:
     One signature each is enough: nothing has to be compiled ahead then.
     """
     return all(_is_cached(dispatcher) for dispatcher, in_every_scan in _kernels if in_every_scan)
+
+
+def kernels_not_cached() -> list[str]:
+    """Names of kernels of the imported modules that neither the disk nor the wheel holds for any signature."""
+    return [each.py_func.__qualname__ for each, _ in _kernels if not _is_cached(each)]
 
 
 @contextmanager
@@ -207,13 +266,15 @@ class _KeyedFiles(IndexDataCacheFile):  # type: ignore[misc] # numba is untyped
                 old.unlink(missing_ok=True)
 
     def load(self, key: Any) -> Any:
+        name = self._name(key)
         try:
-            return self._load_data(self._name(key))
+            return self._load_data(name)
         except (OSError, EOFError, pickle.UnpicklingError):
-            return None
+            return _shipped().load(name)
 
     def is_cached(self) -> bool:
-        return any(Path(self._cache_path).glob(f"{glob.escape(self._base)}.{self._digest_of_sources()}.*.nbc"))
+        begin = f"{self._base}.{self._digest_of_sources()}."
+        return _shipped().has(begin) or any(Path(self._cache_path).glob(f"{glob.escape(begin)}*.nbc"))
 
     def flush(self) -> None:
         for old in Path(self._cache_path).glob(f"{glob.escape(self._base)}.*.nbc"):
@@ -224,24 +285,84 @@ class _KeyedFiles(IndexDataCacheFile):  # type: ignore[misc] # numba is untyped
 
     def _digest_of_sources(self) -> str:
         if not self._sources:
-            self._sources = _digest((self._version, config.BOUNDSCHECK, sorted(_sources(self._function, set()))))
+            versions = (self._version, llvmlite.__version__, config.BOUNDSCHECK, config.USING_SVML)
+            self._sources = _digest((versions, sorted(_sources(self._function, set()))))
         return self._sources
+
+
+class _Shipped(NamedTuple):
+    """Kernels that came with slrig. archive : None if none fit."""
+
+    archive: zipfile.ZipFile | None
+    names: frozenset[str]
+
+    def has(self, begin: str) -> bool:
+        """True if the name of a kernel begins so."""
+        return any(name.startswith(begin) for name in self.names)
+
+    def load(self, name: str) -> Any:
+        """Return the compiled code of this name; None if there is none, or it is damaged."""
+        if self.archive is None or name not in self.names:
+            return None
+        try:
+            return pickle.loads(self.archive.read(name))  # noqa: S301 - as trustworthy as the code beside it
+        except (OSError, EOFError, zipfile.BadZipFile, zlib.error, pickle.UnpicklingError) as error:
+            _log.warning("a compiled kernel of slrig's cannot be read; reinstall slrig", name=name, cause=str(error))
+            return None
+
+
+@cache
+def _shipped() -> _Shipped:
+    path = _SHIPPED / shipped_archive_name()
+    try:
+        archive = zipfile.ZipFile(path)
+    except FileNotFoundError:
+        return _Shipped(None, frozenset())
+    except (OSError, zipfile.BadZipFile) as error:
+        _log.warning("the compiled kernels of slrig cannot be read; reinstall slrig", path=str(path), cause=str(error))
+        return _Shipped(None, frozenset())
+    return _Shipped(archive, frozenset(archive.namelist()))
 
 
 def _digest(value: object) -> str:
     return hashlib.sha256(repr(value).encode()).hexdigest()[:12]
 
 
-def _sources(function: Callable[..., Any], visited: set[Callable[..., Any]]) -> set[tuple[str, int, int]]:
-    """Name, time and size of the source files of a kernel and of the parts that it calls."""
+def _sources(function: Callable[..., Any], visited: set[Callable[..., Any]]) -> set[tuple[str, str]]:
+    """What a kernel and the parts that it calls are compiled from: names and digests of their files, and the constants
+    that they take from others.
+    """
     visited.add(function)
     file = Path(function.__code__.co_filename)
-    files = {(file.name, file.stat().st_mtime_ns, file.stat().st_size)} if file.is_file() else set()
-    for name in function.__code__.co_names:
-        part = function.__globals__.get(name)
-        if isinstance(part, Dispatcher) and part.py_func not in visited:
-            files |= _sources(part.py_func, visited)
-    return files
+    found = {(file.name, _digest_of_file(file))} if file.is_file() else set()
+    for name in _names(function.__code__):
+        value = function.__globals__.get(name)
+        if isinstance(value, Dispatcher):
+            if value.py_func not in visited:
+                found |= _sources(value.py_func, visited)
+        elif isinstance(value, np.ndarray):
+            found.add((name, _digest((value.dtype.str, value.shape, value.tobytes()))))
+        elif isinstance(value, bool | int | float | complex | str | tuple):
+            found.add((name, repr(value)))
+    return found
+
+
+def _names(code: CodeType) -> Iterator[str]:
+    """Names that a function and those within it look up outside."""
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _names(constant)
+
+
+def _digest_of_file(path: Path) -> str:
+    stat = path.stat()
+    return _digest_of_contents(path, stat.st_mtime_ns, stat.st_size)
+
+
+@cache
+def _digest_of_contents(path: Path, _time_ns: int, _bytes: int) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def trim_malloc() -> None:

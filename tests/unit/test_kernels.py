@@ -5,19 +5,33 @@ from __future__ import annotations
 import errno
 import importlib.util
 import os
+import platform
 import subprocess
 import sys
-from collections.abc import Callable
+import zipfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import llvmlite.binding
+import numba
 import numpy as np
 import pytest
 from numba import config
 from numba.core.errors import NumbaError
 
 from slrig import kernels
-from slrig.kernels import are_all_cached, in_bands, kernel, kernel_part, report_compilations
+from slrig.kernels import (
+    CPU_LEVELS,
+    are_all_cached,
+    best_cpu_level,
+    in_bands,
+    kernel,
+    kernel_part,
+    report_compilations,
+    shipped_archive_name,
+    why_compiled,
+)
 
 _ADDS = """
 from slrig.kernels import kernel, kernel_part
@@ -147,6 +161,91 @@ def test_a_kernel_is_compiled_again_if_its_file_was_cut(tmp_path: Path) -> None:
     again = made(tmp_path, added=1)
     assert compiled_by(lambda: again.sums(values)) == ["sums"]
     assert again.sums(values) == 5
+
+
+def shipped(folder: Path, monkeypatch: pytest.MonkeyPatch, *, name: str | None = None) -> Path:
+    """An archive of the kernels that a folder's cache holds, as a wheel has it; the cache is emptied."""
+    archive = folder / (shipped_archive_name() if name is None else name)
+    kept = [*folder.rglob("*.nbc")]
+    with zipfile.ZipFile(archive, "w") as packed:
+        for each in kept:
+            packed.write(each, each.name)
+            each.unlink()
+    monkeypatch.setattr(kernels, "_SHIPPED", folder)
+    kernels._shipped.cache_clear()
+    return archive
+
+
+@pytest.fixture
+def shipping(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder with a kernel that was compiled elsewhere, at another time, and came in a wheel."""
+    (tmp_path / "built").mkdir()
+    made(tmp_path / "built", added=1).sums(np.array([1.0, 2.0]))
+    shipped(tmp_path / "built", monkeypatch)
+    (tmp_path / "installed").mkdir()
+    yield tmp_path / "installed"
+    kernels._shipped.cache_clear()
+
+
+def test_a_kernel_that_came_in_the_wheel_is_not_compiled(shipping: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.array([1.0, 2.0])
+    installed = made(shipping, added=1)
+    os.utime(shipping / "adding.py", ns=(99, 99))
+    monkeypatch.setattr(kernels, "_kernels", [(installed.sums, True)])
+    assert are_all_cached()
+    assert kernels.kernels_not_cached() == []
+    assert compiled_by(lambda: installed.sums(values)) == []
+    assert installed.sums(values) == 5
+    assert why_compiled() is None
+    # Another signature, and another source, are not in there.
+    assert compiled_by(lambda: installed.sums(values.astype(np.float32))) == ["sums", "more"]
+    changed = made(shipping, added=10)
+    assert compiled_by(lambda: changed.sums(values)) == ["sums", "more"]
+    assert changed.sums(values) == 23
+
+
+@pytest.mark.parametrize("kind", ["cut", "flipped", "none", "other versions"])
+def test_a_kernel_is_compiled_where_what_came_in_the_wheel_does_not_fit(
+    shipping: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    archive = shipping.parent / "built" / shipped_archive_name()
+    whole = archive.read_bytes()
+    if kind == "cut":
+        archive.write_bytes(whole[:-100])
+    elif kind == "flipped":
+        archive.write_bytes(whole[:300] + bytes([whole[300] ^ 8]) + whole[301:])
+    elif kind == "none":
+        archive.unlink()
+    else:
+        monkeypatch.setattr(numba, "__version__", "0.1.0")
+    kernels._shipped.cache_clear()
+    values = np.array([1.0, 2.0])
+    installed = made(shipping, added=1)
+    assert compiled_by(lambda: installed.sums(values))[:1] == ["sums"]
+    assert installed.sums(values) == 5
+    if kind in {"none", "other versions"}:
+        assert ("without compiled kernels" if kind == "none" else "numba-0.1.0") in (why_compiled() or "")
+
+
+def test_a_constant_that_a_kernel_takes_from_elsewhere_is_part_of_its_key(tmp_path: Path) -> None:
+    (tmp_path / "caller.py").write_text(
+        "from slrig.kernels import kernel\n\ndef of(limit):\n    globals()['LIMIT'] = limit\n\n"
+        "@kernel(in_every_scan=False)\ndef above(values):\n    return sum([LIMIT for each in values])\n"
+    )
+    for limit in (2.0, 3.0):
+        caller = loaded(tmp_path / "caller.py")
+        caller.of(limit)
+        assert caller.above(np.zeros(2)) == 2 * limit
+
+
+@pytest.mark.parametrize("level", [*CPU_LEVELS, None])
+def test_the_level_of_a_processor_is_the_best_that_it_has_whole(
+    monkeypatch: pytest.MonkeyPatch, level: str | None
+) -> None:
+    has = dict.fromkeys({"sse2", *(CPU_LEVELS[level] if level else {"ssse3"})}, True) | {"avx512f": False}
+    monkeypatch.setattr(llvmlite.binding, "get_host_cpu_features", lambda: has)
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
+    assert best_cpu_level() == level
 
 
 def test_a_full_disk_fails_no_kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
