@@ -13,10 +13,11 @@ from filelock import FileLock
 
 from slrig.config import read_rig
 from slrig.discovery import open_rig
+from slrig.examples import EXAMPLES
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ScanPlan
 
-SCENES = Path(__file__).parents[1] / "config" / "scenes"
+SCENES = EXAMPLES / "scenes"
 
 _HEAD = """
 name = "sphere"
@@ -56,7 +57,7 @@ blur_px = 0.6
 
 @dataclass(frozen=True)
 class Rendered:
-    """A ball before a plate, as `config/rigs/sphere.toml` at half the size; without cameras, that rig itself.
+    """A ball before a plate, as `slrig/examples/rigs/sphere.toml` at half the size; without cameras, that rig itself.
 
     cameras_mm, projector_mm : where the devices stand. plan : of the scan. truth : whether what the rig knows of its
     scene stays in the bundle: a reconstruction is then compared with it, which takes longer than all the rest.

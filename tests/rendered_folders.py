@@ -21,12 +21,12 @@ from simulated_rig.options import HeadOptions
 from simulated_rig.rendering import CameraView, SceneState
 from simulated_rig.scene import build_surface, read_scene
 from slrig.errors import SlrigError
+from slrig.examples import EXAMPLES
 from slrig.importers import ImageNaming, ProjectorCode, assign_images
 from slrig.importers.captures import ImageAssignment
 from slrig.model import Axis, Black, Gray, LineShift, Pattern, Pixels, Sine, Size, White
 from tests.light_bound import ExposedView
 
-CONFIG = Path(__file__).parents[1] / "config"
 SCENES = (
     ("relief", Size(512, 384), Size(480, 384)),
     ("stairs", Size(640, 400), Size(480, 360)),
@@ -47,14 +47,14 @@ class FolderScene:
 
     def __init__(self, scene: str, projector: Size, camera: Size) -> None:
         self.size = projector
-        table = tomllib.loads((CONFIG / "rigs" / "relief.toml").read_text(encoding="utf-8"))["head"]
+        table = tomllib.loads((EXAMPLES / "rigs" / "relief.toml").read_text(encoding="utf-8"))["head"]
         del table["driver"]
         table["projector"] = _scaled(table["projector"], projector)
         table["camera"] = [_scaled(table["camera"][0], camera)]
         table["samples_per_axis"] = 2
         options = HeadOptions.model_validate(table)
         eye, lamp = options.camera[0], options.projector
-        surface = build_surface(read_scene(CONFIG / "scenes" / f"{scene}.toml"), CONFIG / "scenes")
+        surface = build_surface(read_scene(EXAMPLES / "scenes" / f"{scene}.toml"), EXAMPLES / "scenes")
         distance_mm = float(np.linalg.norm(lamp.pinhole().centre_mm))
         stage = SceneState(surface, lamp.pinhole(), working_distance_mm=distance_mm)
         view = CameraView(

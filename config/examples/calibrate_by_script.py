@@ -1,6 +1,6 @@
 """Calibrate a rig whose positioner holds the board: capture a pose at every position, solve, use a good result.
 
-slrig serve config/rigs/rendered-calibration.toml
+slrig serve rendered-calibration
 SLRIG_API_KEY=... python config/examples/calibrate_by_script.py charuco 11 8 14 --marker-mm 10.5
 """
 

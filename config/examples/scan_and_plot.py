@@ -1,6 +1,6 @@
 """Scan, print how good the scan is, and write its depth as a picture.
 
-slrig serve config/rigs/demo.toml                 # in another terminal; prints the key
+slrig serve demo                 # in another terminal; prints the key
 SLRIG_API_KEY=... python config/examples/scan_and_plot.py depth.png
 """
 

@@ -1,6 +1,6 @@
 """Scan an object from all sides on the rig's turntable, combine the views, and fetch the model.
 
-slrig serve config/rigs/turntable.toml
+slrig serve turntable
 SLRIG_API_KEY=... python config/examples/several_views.py 8 model.ply
 """
 

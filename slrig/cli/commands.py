@@ -10,6 +10,7 @@ import os
 import shlex
 import sys
 from collections.abc import Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -36,6 +37,7 @@ from slrig.cli.options import (
 )
 from slrig.cli.service import Data, backup, check, fleet, key_app, pool_app, restore, serve, worker
 from slrig.errors import ConfigError, SlrigError
+from slrig.examples import rig_path
 
 if TYPE_CHECKING:
     from slrig.importers import UnderstoodFolder
@@ -292,11 +294,15 @@ def slrig(
 
 @app.command()
 def demo(
-    rig: Annotated[
-        Path | None,
-        typer.Argument(metavar="RIG", help="Rig file. Default: config/rigs/demo.toml, a rendered rig."),
-    ] = None,
+    rig: RigFile = Path("demo"),
     output: Annotated[Path, typer.Option(help="Folder for mesh, preview and report.")] = Path("scans/demo"),
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for what the service keeps. Default: demo within ~/.local/share/slrig.", show_default=False
+        ),
+    ] = None,
+    show: Annotated[bool, typer.Option("--open", help="Show the page at the result, until Ctrl-C.")] = False,
 ) -> None:
     """Scan once on a rendered rig, and compare with the truth.
 
@@ -305,7 +311,7 @@ def demo(
     """
     from slrig.cli.scan import run_demo
 
-    run_demo(rig, output)
+    run_demo(rig, output, data, show=show)
 
 
 @app.command()
@@ -314,7 +320,9 @@ def scan(
     *,
     service: ServiceOptions,
     rig: RigOption = None,
-    output: Annotated[Path, typer.Option(help="Folder for the files of the scan.")] = Path("scans/latest"),
+    output: Annotated[
+        Path | None, typer.Option(help="Folder for the files of the scan. Default: of its time, within scans.")
+    ] = None,
     file: Annotated[
         list[str] | None,
         typer.Option(
@@ -353,9 +361,10 @@ def scan(
     queue: Annotated[bool, typer.Option("--queue", help="Wait in line if the rig is held.")] = False,
     repeat: Annotated[int, typer.Option(min=1, help="So many scans in a row, each into a folder of its number.")] = 1,
     every_s: Annotated[float | None, typer.Option(help="From the start of one to that of the next, seconds.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite files of an earlier scan in --output.")] = False,
 ) -> None:
     """Scan with a running service, and fetch the mesh."""
-    from slrig.cli.scan import FILES, assisted, client_of, scan_with, series_with, tell_result
+    from slrig.cli.scan import FILES, assisted, client_of, refuse_earlier, scan_with, series_with, tell_result
 
     request = given(
         label=label,
@@ -376,6 +385,9 @@ def scan(
     files = tuple(file or FILES)
     if asked.budget_s is not None and not asked.assist:
         raise ConfigError("--budget-s: it is for --assist, which finds exposures within it. Give both, or neither.")
+    if output is None:
+        output = Path("scans") / f"{datetime.now().astimezone():%Y-%m-%d-%H%M%S}"
+    refuse_earlier(output, files, force=force)
     with client_of(rig, service) as client:
         if asked.assist:
             request = assisted(client, request, budget_s=asked.budget_s)
@@ -455,11 +467,20 @@ def init(
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Ask nothing; take all cameras that are plugged in.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file of --output.")] = False,
+    example: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Write this example instead, as demo or webcams-and-hdmi, with its scene."),
+    ] = None,
 ) -> None:
     """Write a rig file for what is plugged in.
 
     Asks what it cannot know. Checks the file by the drivers before it is written; opens no device.
     """
+    if example is not None:
+        from slrig.cli.rig_file import write_example
+
+        write_example(example, output, force=force)
+        return
     from slrig.cli.rig_file import init as write_rig_file
 
     write_rig_file(
@@ -575,7 +596,11 @@ def report(
 def verify(
     source: Annotated[
         Path,
-        typer.Argument(metavar="SOURCE", help="A recorded pose of the board, a bundle; or a rig file to shoot one."),
+        typer.Argument(
+            metavar="SOURCE",
+            callback=rig_path,
+            help="A recorded pose of the board, a bundle; or a rig file to shoot one.",
+        ),
     ],
     board: BoardArguments,
     calibration: Annotated[

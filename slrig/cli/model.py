@@ -15,6 +15,7 @@ import typer
 
 from slrig.cli.options import BoardArguments, ServiceOptions, given, grouped
 from slrig.errors import ConfigError
+from slrig.examples import rig_path
 from slrig.jobs.listener import Listener
 
 if TYPE_CHECKING:
@@ -42,7 +43,11 @@ def model(
     ] = None,
     rig: Annotated[
         Path | None,
-        typer.Option(help="With --shoot: the rig file to shoot with; what the folder has of an earlier call stays."),
+        typer.Option(
+            metavar="RIG",
+            callback=rig_path,
+            help="With --shoot: the rig file to shoot with; what the folder has of an earlier call stays.",
+        ),
     ] = None,
     manual: Annotated[bool, typer.Option("--manual", help="With --shoot: turn it yourself, when told.")] = False,
     service: ServiceOptions,

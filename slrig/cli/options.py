@@ -13,19 +13,29 @@ import typer
 
 from slrig import KEY_VARIABLE
 from slrig.errors import ConfigError, SlrigError
+from slrig.examples import rig_path
 
 if TYPE_CHECKING:
     from slrig.client import Client
 
-RigFile = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file; examples are in config/rigs.")]
+RigFile = Annotated[
+    Path, typer.Argument(metavar="RIG", callback=rig_path, help="Rig file, or the name of an example, such as demo.")
+]
 RigHere = Annotated[
     Path | None,
-    typer.Argument(metavar="[RIG]", help="Rig file: the rig is opened here. Default: the rig of the running service."),
+    typer.Argument(
+        metavar="[RIG]",
+        callback=rig_path,
+        help="Rig file: the rig is opened here. Default: the rig of the running service.",
+    ),
 ]
 RigOption = Annotated[
     Path | None,
     typer.Option(
-        "--rig", metavar="RIG", help="Rig file: run its service for this command alone. Default: a running one."
+        "--rig",
+        metavar="RIG",
+        callback=rig_path,
+        help="Rig file: run its service for this command alone. Default: a running one.",
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]

@@ -33,8 +33,10 @@ from slrig.discovery import (
     installed_drivers,
     option_model,
 )
+from slrig.disk import storage_errors
 from slrig.doctor import refuse_existing, toml_value
 from slrig.errors import ConfigError, DeviceGoneError
+from slrig.examples import copy_example
 
 Schema = Mapping[str, Any]
 
@@ -281,6 +283,14 @@ def init(
     _tell(lit, shot, output)
 
 
+def write_example(name: str, output: Path, *, force: bool) -> None:
+    """Write an example's rig file and its scene. Raises ConfigError, StorageError."""
+    refuse_existing(output, force=force)
+    with storage_errors(output):
+        copy_example(name, output)
+    _say(f"Wrote {output}. Change it; slrig demo {output} scans with it, slrig serve {output} starts its service.")
+
+
 def terminal() -> bool:
     """Whether somebody can be asked."""
     return sys.stdin.isatty() and sys.stdout.isatty()
@@ -446,7 +456,7 @@ def _nothing_there(
             for head in offered["head"]
         ),
         f"name what cannot be found: slrig init {flags}",
-        "without any hardware there is a rendered rig: slrig demo, or slrig serve config/rigs/demo.toml",
+        "without any hardware there is a rendered rig: slrig demo, or slrig serve demo",
     ]
     return "\n  ".join(lines)
 
@@ -577,6 +587,9 @@ def list_devices(*, as_json: bool) -> None:
     """Print the drivers that are installed, the devices that are plugged in, and what is missing to drive more."""
     with _only_ours_on_stdout():
         drivers = installed_drivers()
+        finders = sorted({driver.name for driver in drivers if driver.kind == "finder" and driver.fault is None})
+        # Some ask a network, and wait for answers.
+        typer.echo(f"Looking for devices of {', '.join(finders)} …", err=True)
         found = discover_devices()
     if as_json:
         print_json(devices_document(drivers, found))

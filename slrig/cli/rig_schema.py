@@ -1,6 +1,6 @@
 """The JSON schema of rig files with the options of slrig's own drivers, for editors.
 
-`python -m slrig.cli.rig_schema` prints it; it is kept as config/schema.json.
+`python -m slrig.cli.rig_schema` prints it; it is kept as slrig/examples/schema.json.
 """
 
 from __future__ import annotations

@@ -8,7 +8,9 @@ import secrets
 import shlex
 import subprocess
 import sys
+import threading
 import time
+import webbrowser
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
@@ -18,50 +20,17 @@ from typing import Any
 import typer
 from rich.table import Column
 
-import slrig
 from slrig import KEY_VARIABLE
-from slrig.cli.display import ProgressDisplay, counted, print_table, progress_shown
+from slrig.cli.display import ProgressDisplay, counted, print_table, progress_shown, quality_lines
 from slrig.cli.options import ServiceOptions
 from slrig.client import Client, ScanJob
+from slrig.config import default_data_dir
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
+from slrig.examples import example_names, is_example
 from slrig.jobs.listener import Listener
 from slrig.scan.artefacts import truth_notes
 from slrig.scan.formats import camera_prefixes, installed_by, offered
-
-
-def quality_lines(summary: Mapping[str, Any]) -> list[str]:
-    """What a report's summary says about the frames, the mesh and its error, one line each."""
-    lines = []
-    if summary.get("identity") is not None:
-        lines.append(f"{'frames':<10}{summary['identity']}")
-    mesh = summary.get("mesh") or {}
-    figures = mesh.get("figures") or {}
-    if figures.get("triangles") is not None:
-        lines.append(f"{'size':<10}{figures['vertices']:,} vertices, {figures['triangles']:,} triangles")
-    sigma = (mesh.get("sigma_mm") or {}).get("p50")
-    if sigma is not None:
-        holds = mesh.get("sigma_holds")
-        words = "" if holds is None else f"; {holds}"
-        lines.append(f"{'stated':<10}standard deviation of a point {sigma:.4f} mm (median){words}")
-    truth = summary.get("truth") or {}
-    if truth:
-        lines.append(f"{'error':<10}{_error(truth)}")
-    return lines + [f"{'note':<10}{words}" for words in summary.get("notes") or []]
-
-
-def _error(truth: Mapping[str, Any]) -> str:
-    """The error against the known truth: of what is near it, and how much is not."""
-    rms_mm, beyond, complete = (truth.get(name) for name in ("rms_mm", "gross_fraction", "complete_0.3mm"))
-    words = "nothing within 1 mm of the known truth"
-    if rms_mm is not None:
-        words = f"rms {rms_mm:.4f} mm against the known truth"
-        # Reports of earlier versions have the error alone.
-        words += (
-            "" if beyond is None else f", of the {1 - beyond:.1%} of the area within 1 mm; {beyond:.1%} beyond 1 mm"
-        )
-    return words if complete is None else f"{words}, {complete:.1%} of the visible surface within 0.3 mm"
-
 
 _HEADS = ("scan", Column("triangles", justify="right"), Column("σ mm", justify="right"), "")
 _DIGITS = 3
@@ -206,6 +175,15 @@ def _completed(
     return result.scan
 
 
+def refuse_earlier(output: Path, files: Sequence[str], *, force: bool) -> None:
+    """Raise ConfigError, before anything is shot, if files of an earlier scan or series would be overwritten."""
+    there = [name for name in (*files, f"{1:0{_DIGITS}}") if (output / name).exists()]
+    if there and not force:
+        found = ", ".join(there)
+        message = f"{output} has {found} of an earlier scan. Choose another folder, or overwrite it with --force."
+        raise ConfigError(message)
+
+
 def _require_offered(client: Client, files: Sequence[str]) -> None:
     """Refuse names that no scan has before minutes are spent on one."""
     unknown, cameras = [name for name in files if name not in offered(())], []
@@ -236,39 +214,63 @@ _SERVICE_SHARE = 0.05
 LABEL = "demo"
 
 
-def run_demo(rig: Path | None, output: Path) -> None:
-    """Start a service, scan, fetch, compare, tell; the service is gone afterwards.
+def run_demo(rig: Path, output: Path, data: Path | None, *, show: bool) -> None:
+    """Start a service, scan, fetch, compare, print; the service is gone afterwards.
+
+    data : data folder of the service; None for `demo` in the usual one. show : open the page at the scan, and keep the
+    service until the person ends it.
 
     Raises ConfigError where there is no such rig file, ServiceError where no service starts or the scan fails.
     """
-    rig = _rig_file(rig)
-    data = output / "service"
-    with progress_shown() as display, rig_service(rig, data, display) as client:
-        scan = scan_with(client, {"label": LABEL}, output, Listener(report=display).within(_SERVICE_SHARE, 1.0))
-        removed = remove_earlier(client, scan)
-    tell_result(scan, output)
-    if removed:
-        typer.echo(f"Note: {counted(removed, 'earlier demo scan')} of rig '{scan['rig']}' removed from {data}.")
-    bundle = data / "scans" / scan["id"] / "bundle"
-    _tell_next(rig, bundle, output)
+    data = default_data_dir() / "demo" if data is None else data
+    with ExitStack() as stack:
+        with progress_shown() as display:
+            client = stack.enter_context(rig_service(rig, data, display, no_key=show))
+            scan = scan_with(client, {"label": LABEL}, output, Listener(report=display).within(_SERVICE_SHARE, 1.0))
+            removed = remove_earlier(client, scan)
+        tell_result(scan, output)
+        size_mb = sum(path.stat().st_size for path in data.rglob("*") if path.is_file()) / 1e6
+        typer.echo(f"{'data':<9} {data}, {size_mb:.0f} MB: the frames, and all that the service keeps")
+        if removed:
+            typer.echo(f"Note: {counted(removed, 'earlier demo scan')} of rig '{scan['rig']}' removed from there.")
+        if show:
+            _show_page(f"{_url(data)}/#/scan/{scan['id']}")
+        else:
+            _tell_next(rig, data / "scans" / scan["id"] / "bundle", output)
     require_sound(scan)
 
 
+def _show_page(address: str) -> None:
+    """Open the page in the person's browser, and wait for Ctrl-C."""
+    opened = webbrowser.open(address)
+    typer.echo(f"{'page':<9} {address}{'' if opened else ' (no browser was found here)'}; Ctrl-C ends the service")
+    with suppress(KeyboardInterrupt):
+        threading.Event().wait()
+
+
 @contextmanager
-def rig_service(rig: Path, data: Path, display: ProgressDisplay) -> Iterator[Client]:
+def rig_service(rig: Path, data: Path, display: ProgressDisplay, *, no_key: bool = False) -> Iterator[Client]:
     """A client of a service that holds the rig of a file as long as the block lasts, in a process of its own.
 
-    data : its data folder, which is made. Raises ServiceError: it does not start, or the rig cannot be opened;
-    ConfigError: there is no such rig file; StorageError.
+    data : its data folder, which is made. no_key : programs and browsers of this machine need no key.
+
+    Raises ServiceError: it does not start, or the rig cannot be opened; ConfigError: there is no such rig file;
+    StorageError.
     """
     if not rig.is_file():
-        message = f"There is no rig file {rig}. Examples are in config/rigs; slrig init writes one for your devices."
+        message = (
+            f"There is no rig file {rig}, and no example of that name ({', '.join(example_names())}). "
+            "slrig init writes a rig file for your devices."
+        )
         raise ConfigError(message)
     with storage_errors(data):
         data.mkdir(parents=True, exist_ok=True)
     key = secrets.token_urlsafe(32)
     display("starting the service", 0.0, str(rig))
-    with _service(rig, data, key) as process, Client(_url(process, data), key) as client:
+    with (
+        _service(rig, data, key, ["--no-key"] if no_key else []) as process,
+        Client(_await_address(process, data), key) as client,
+    ):
         _await_ready(process, client, data, display)
         yield client
 
@@ -296,20 +298,10 @@ def require_sound(scan: Mapping[str, Any]) -> None:
         raise typer.Exit(1)
 
 
-def _rig_file(given: Path | None) -> Path:
-    wanted = given or Path("config/rigs/demo.toml")
-    checkout = Path(slrig.__file__).resolve().parent.parent
-    for folder in (Path(), checkout) if given is None else (Path(),):
-        if (folder / wanted).is_file():
-            return folder / wanted
-    message = f"There is no rig file {wanted}. Run the demo in slrig's checkout, or name a rig file: slrig demo RIG."
-    raise ConfigError(message)
-
-
 @contextmanager
-def _service(rig: Path, data: Path, key: str) -> Iterator[subprocess.Popen[bytes]]:
+def _service(rig: Path, data: Path, key: str, options: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
     (data / "service.json").unlink(missing_ok=True)
-    command = [sys.executable, "-m", "slrig.cli", "serve", str(rig), "--port", "0", "--until-eof"]
+    command = [sys.executable, "-m", "slrig.cli", "serve", str(rig), "--port", "0", "--until-eof", *options]
     with (data / "service.log").open("wb") as log:
         process = subprocess.Popen(  # noqa: S603 - our own command
             [*command, "--host", "127.0.0.1", "--data", str(data)],
@@ -334,13 +326,17 @@ def _service(rig: Path, data: Path, key: str) -> Iterator[subprocess.Popen[bytes
             process.wait()
 
 
-def _url(process: subprocess.Popen[bytes], data: Path) -> str:
-    address = data / "service.json"
+def _await_address(process: subprocess.Popen[bytes], data: Path) -> str:
+    """Wait for the service, and return its address."""
     deadline = time.monotonic() + START_LIMIT_S
-    while not address.is_file():
+    while not (data / "service.json").is_file():
         _require_alive(process, data, deadline)
         time.sleep(_POLL_S)
-    url: str = json.loads(address.read_text(encoding="utf-8"))["url"]
+    return _url(data)
+
+
+def _url(data: Path) -> str:
+    url: str = json.loads((data / "service.json").read_text(encoding="utf-8"))["url"]
     return url
 
 
@@ -400,16 +396,22 @@ def _require_alive(process: subprocess.Popen[bytes], data: Path, deadline: float
 
 def _tell_next(rig: Path, bundle: Path, output: Path) -> None:
     live, again = (shlex.quote(str(output.parent / f"{output.name}-{end}")) for end in ("live", "again"))
-    # Paths in a rig file are relative to it, so that a copy belongs beside it.
-    rig_text, own, bundle_text = (shlex.quote(str(path)) for path in (rig, rig.with_name("my-rig.toml"), bundle))
     # As it was called: in a fresh checkout that is .venv/bin/slrig, and no slrig is on the path.
     program = shlex.quote(sys.argv[0]) if Path(sys.argv[0]).name == "slrig" else "slrig"
+    if is_example(rig):
+        rig_text, own = rig.stem, Path("my-rig.toml")
+        copy = f"{program} init --example {rig.stem} --output {own}"
+    else:
+        # Paths in a rig file are relative to it, so that a copy belongs beside it.
+        rig_text, own = shlex.quote(str(rig)), rig.with_name("my-rig.toml")
+        copy = f"cp {rig_text} {shlex.quote(str(own))}"
+    own_text, bundle_text = (shlex.quote(str(path)) for path in (own, bundle))
     typer.echo(
         f"""
 Next:
   1. Your own rig: copy a rig file, change it, and run it.
-       cp {rig_text} {own}
-       {program} demo {own}
+       {copy}
+       {program} demo {own_text}
   2. A live service: start it, and scan with it from another terminal, with the key that it prints.
        {program} serve {rig_text}
        {KEY_VARIABLE}=KEY {program} scan --output {live}

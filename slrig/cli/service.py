@@ -13,6 +13,8 @@ import typer
 
 from slrig.api.scopes import KeyScope
 from slrig.cli.options import AsJson, RigFile, ServiceOptions, given, grouped
+from slrig.disk import storage_errors
+from slrig.examples import copy_example, is_example
 
 if TYPE_CHECKING:
     from slrig.api.auth import KeyRing
@@ -141,7 +143,20 @@ def serve(
         compute_store=store,
         compute_certificates=certificates,
     )
-    run_service(read_settings(settings, **told), read_rig(rig), new_key=new_key, until_eof=until_eof, say=typer.echo)
+    chosen = read_settings(settings, **told)
+    if is_example(rig):
+        rig = _own_copy(rig, chosen.data_dir)
+    run_service(chosen, read_rig(rig), new_key=new_key, until_eof=until_eof, say=typer.echo)
+
+
+def _own_copy(rig: Path, data: Path) -> Path:
+    """A copy of an example's rig file in the data folder, which the page may change, or the one made before."""
+    own = data / rig.name
+    if not own.exists():
+        with storage_errors(own):
+            data.mkdir(parents=True, exist_ok=True)
+            copy_example(rig.stem, own)
+    return own
 
 
 key_app = typer.Typer(no_args_is_help=True, help="Who may use a service, and what for.")

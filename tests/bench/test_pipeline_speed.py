@@ -25,6 +25,7 @@ from slrig.bundle import Bundle, read_bundle
 from slrig.capture.verifier import check_capture
 from slrig.config import read_rig
 from slrig.discovery import open_rig
+from slrig.examples import EXAMPLES
 from slrig.model import Calibration, Mesh, Region
 from slrig.model.capture import CaptureHeader
 from slrig.scan.acquisition import capture_frames
@@ -43,7 +44,7 @@ FIRST_TO_MESH_S = 1.0
 LAST_TO_MESH_S = 0.35
 FRAMES_PER_S = 30.0
 MOST_MEMORY_MIB = 1536
-SCENE = Path(__file__).parents[2] / "config" / "scenes" / "demo.toml"
+SCENE = EXAMPLES / "scenes" / "demo.toml"
 RIG = f"""
 name = "speed"
 [head]

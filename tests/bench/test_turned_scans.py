@@ -22,6 +22,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from slrig.examples import EXAMPLES
 from slrig.meshing.quality import SearchTree
 from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray, Mesh
@@ -29,7 +30,7 @@ from slrig.model_jobs.combining import read_mesh
 from tests.turned_views import displacement_mm
 from tests.unit.multiview.known_views import flange, plate_on_box, relief, star, vase
 
-DEMO = Path(__file__).parents[2] / "config" / "rigs" / "demo.toml"
+DEMO = EXAMPLES / "rigs" / "demo.toml"
 MIDDLE_MM = np.array([8.0, 0.0, 25.0])
 AXIS = np.array([0.03, -0.94, -0.34]) / np.linalg.norm([0.03, -0.94, -0.34])
 POINT_MM = MIDDLE_MM + np.array([3.0, 0.0, -2.0])

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from slrig.client import Client
+from slrig.examples import EXAMPLES
 from tests.e2e.conftest import KEY, ServiceProcess, python, serving, write_rig
 from tests.e2e.test_calibration_walk import write_rig as write_board_rig
 from tests.e2e.test_import import Recorded, lay_out
 
 pytestmark = pytest.mark.slow
 
-CONFIG = Path(__file__).resolve().parents[2] / "config"
-EXAMPLES = CONFIG / "examples"
+SCRIPTS = Path(__file__).resolve().parents[2] / "config" / "examples"
 SECRET = "whsec_" + base64.b64encode(bytes(range(32))).decode()
 
 
@@ -30,7 +30,7 @@ SECRET = "whsec_" + base64.b64encode(bytes(range(32))).decode()
 def receiver() -> Iterator[subprocess.Popen[str]]:
     """The receiver of notices, as a process; its first line names its port."""
     process = subprocess.Popen(  # noqa: S603 - our own program
-        [sys.executable, EXAMPLES / "webhook_receiver.py", "0"],
+        [sys.executable, SCRIPTS / "webhook_receiver.py", "0"],
         env={**os.environ, "SLRIG_WEBHOOK_SECRET": SECRET},
         stdout=subprocess.PIPE,
         text=True,
@@ -45,7 +45,7 @@ def service(tmp_path_factory: pytest.TempPathFactory, receiver: subprocess.Popen
     assert receiver.stdout is not None
     port = receiver.stdout.readline().split()[-1]
     settings = {"SLRIG_WEBHOOK_URL": f"http://127.0.0.1:{port}/", "SLRIG_WEBHOOK_SECRET": SECRET}
-    with serving(CONFIG / "rigs" / "turntable.toml", tmp_path_factory.mktemp("data") / "data", **settings) as service:
+    with serving(EXAMPLES / "rigs" / "turntable.toml", tmp_path_factory.mktemp("data") / "data", **settings) as service:
         yield service
 
 
@@ -55,7 +55,7 @@ def run(*words: object, folder: Path, service: ServiceProcess | None = None) -> 
 
 
 def test_scan_and_plot(service: ServiceProcess, receiver: subprocess.Popen[str], tmp_path: Path) -> None:
-    said = run(EXAMPLES / "scan_and_plot.py", "depth.png", folder=tmp_path, service=service)
+    said = run(SCRIPTS / "scan_and_plot.py", "depth.png", folder=tmp_path, service=service)
     assert "median standard deviation" in said
     assert {path.name for path in tmp_path.iterdir()} == {"depth.png", "mesh.ply"}
     # The service tells the receiver, which checks the signature.
@@ -64,13 +64,13 @@ def test_scan_and_plot(service: ServiceProcess, receiver: subprocess.Popen[str],
 
 
 def test_region_and_preset(service: ServiceProcess, tmp_path: Path) -> None:
-    said = run(EXAMPLES / "region_and_preset.py", -30, -10, -60, 30, 10, 60, folder=tmp_path, service=service)
+    said = run(SCRIPTS / "region_and_preset.py", -30, -10, -60, 30, 10, 60, folder=tmp_path, service=service)
     whole, part = (int(line.split()[1].replace(",", "")) for line in said.splitlines())
     assert 0 < part < 0.8 * whole
 
 
 def test_several_views(service: ServiceProcess, tmp_path: Path) -> None:
-    run(EXAMPLES / "several_views.py", 8, "model.ply", 2, 0, 1.5, 0.03, -1, -0.05, folder=tmp_path, service=service)
+    run(SCRIPTS / "several_views.py", 8, "model.ply", 2, 0, 1.5, 0.03, -1, -0.05, folder=tmp_path, service=service)
     assert (tmp_path / "model.ply").read_bytes().startswith(b"ply")
 
 
@@ -81,7 +81,7 @@ def test_calibrate_by_script(tmp_path: Path) -> None:
             while not client.rig.get()["positions"]:
                 pass
         board = ("chessboard", 8, 5, 20, "--most-error-mm", 1)
-        said = run(EXAMPLES / "calibrate_by_script.py", *board, folder=tmp_path, service=service)
+        said = run(SCRIPTS / "calibrate_by_script.py", *board, folder=tmp_path, service=service)
         assert said.count("succeeded") == 10
         assert "is in use" in said
 
@@ -90,7 +90,7 @@ def test_import_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scan = Recorded(tmp_path / "rig", "opencv", monkeypatch)
     images = lay_out(tmp_path / "images", scan.images, "pattern_cam1_im{}.png", first=1)
     calibration = scan.folder / "calibration.json"
-    said = run(EXAMPLES / "import_folder.py", images, "200x160", calibration, "mesh", "left", folder=tmp_path)
+    said = run(SCRIPTS / "import_folder.py", images, "200x160", calibration, "mesh", "left", folder=tmp_path)
     assert "vertices" in said
     assert (tmp_path / "mesh" / "mesh.ply").exists()
 

@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 import pytest
 from filelock import FileLock
 
-RIGS = Path(__file__).parents[2] / "config" / "rigs"
+from slrig.examples import EXAMPLES
+
+RIGS = EXAMPLES / "rigs"
 
 
 class Scan(NamedTuple):
@@ -24,7 +26,7 @@ class Scan(NamedTuple):
 
 @pytest.fixture(scope="session")
 def scan_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scan]:
-    """The scan of a rig of `config/rigs`, by its name. Processes that share out the tests share the scans, too."""
+    """The scan of an example rig, by its name. Processes that share out the tests share the scans, too."""
     root = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         root = root.parent

@@ -1,4 +1,4 @@
-"""A relief before the rig of `config/rigs/relief.toml`, under light that is worse in one property than the best.
+"""A relief before the example rig `relief`, under light that is worse in one property than the best.
 
 The exposure is set as an operator or an automatic exposure sets it: white comes near full scale and nowhere clips.
 """
@@ -17,6 +17,7 @@ from simulated_rig.options import HeadOptions
 from simulated_rig.rendering import CameraView, SceneState
 from simulated_rig.scene import SceneSurface, build_surface, read_scene
 from slrig.bundle import write_bundle, write_truth
+from slrig.examples import EXAMPLES
 from slrig.model import Calibration, CameraFormat, Capture, Shot, Surface, Truth
 from slrig.patterns.sequence import profile
 from slrig.scan.artefacts import decode_mesh_ply
@@ -24,8 +25,7 @@ from slrig.scan.plan import PatternPlan, pattern_sequence
 from tests.golden.test_bundles import reconstructed
 from tests.light_bound import ExposedView
 
-CONFIG = Path(__file__).parents[2] / "config"
-SCENES = CONFIG / "scenes"
+SCENES = EXAMPLES / "scenes"
 ALBEDO = 0.85
 WHITE_LEVEL = 0.85
 BRIGHTEST_PERCENT = 99.9
@@ -70,7 +70,7 @@ def scanned(light: Light, work: Path, *, share: float = 1.0) -> Figures:
 
     share : the middle of the camera's image that is kept.
     """
-    table = tomllib.loads((CONFIG / "rigs" / "relief.toml").read_text(encoding="utf-8"))["head"]
+    table = tomllib.loads((EXAMPLES / "rigs" / "relief.toml").read_text(encoding="utf-8"))["head"]
     del table["driver"]
     table["projector"] |= {"gamma": light.gamma, "signal_blur_px": light.signal_blur_px}
     table["camera"] = [_cut(table["camera"][0], share)]

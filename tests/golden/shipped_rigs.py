@@ -1,4 +1,4 @@
-"""Rigs of `config/rigs`, with some of their text or of their scene's replaced."""
+"""Rigs of `slrig/examples/rigs`, with some of their text or of their scene's replaced."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 
-CONFIG = Path(__file__).parents[2] / "config"
+from slrig.examples import EXAMPLES
+
 SMALL = {
     "size_px = [480, 384]": "size_px = [240, 192]",
     "principal_px = [241.4, 189.7]": "principal_px = [121.4, 93.7]",
@@ -19,9 +20,9 @@ PAINT = f"albedo = 0.85\n{GRAINY}"
 
 def rig_file(folder: Path, rig: str, *, scene: Mapping[str, str], head: Mapping[str, str]) -> Path:
     """A rig and its scene in a folder, each with some of its text replaced."""
-    text = (CONFIG / "rigs" / f"{rig}.toml").read_text(encoding="utf-8")
+    text = (EXAMPLES / "rigs" / f"{rig}.toml").read_text(encoding="utf-8")
     name = tomllib.loads(text)["head"]["scene"]
-    (folder / "scene.toml").write_text(replaced((CONFIG / "rigs" / name).read_text(encoding="utf-8"), scene))
+    (folder / "scene.toml").write_text(replaced((EXAMPLES / "rigs" / name).read_text(encoding="utf-8"), scene))
     path = folder / "rig.toml"
     path.write_text(replaced(text, {name: "scene.toml", **head}))
     return path

@@ -72,7 +72,7 @@ class Rig:
 
 
 def rig(thing: Mapping[str, object], *, size_px: tuple[int, int], blur_px: float, columns: int = 512) -> Rig:
-    """Return a rig like those in `config/rigs`, whose projector lights all that the camera sees of `thing`.
+    """Return a rig like those in `slrig/examples/rigs`, whose projector lights all that the camera sees of `thing`.
 
     blur_px : of both lenses; columns : of the projector. The sensor reads 8 bits, 30 000 electrons deep, above a
     pedestal that keeps its noise.

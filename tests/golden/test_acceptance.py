@@ -20,11 +20,12 @@ from slrig.config import RigConfig, read_rig
 from slrig.devices import Rig
 from slrig.discovery import open_rig
 from slrig.errors import NothingToReconstructError
+from slrig.examples import EXAMPLES
 from slrig.jobs.records import Holder
 from slrig.model import Calibration
 
 pytestmark = pytest.mark.slow
-RIG = Path(__file__).parents[2] / "config" / "rigs" / "ball_bar.toml"
+RIG = EXAMPLES / "rigs" / "ball_bar.toml"
 """Small: the demonstration's resolution over half its view."""
 
 FORM_SIGMAS = 7.5

@@ -35,6 +35,7 @@ from slrig.calibration.solution import ExpectedError, covariance_modes, point_se
 from slrig.calibration.solving.solve import solve
 from slrig.config import read_rig
 from slrig.discovery import open_rig
+from slrig.examples import EXAMPLES
 from slrig.model import Calibration, FloatArray, Pinhole, SolveRecord
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ScanPlan
@@ -44,7 +45,7 @@ from tests.unit.calibration.solving.against_truth import in_first_camera
 
 pytestmark = pytest.mark.slow
 
-RELIEF = (Path(__file__).parents[2] / "config" / "rigs" / "relief.toml").read_text(encoding="utf-8")
+RELIEF = (EXAMPLES / "rigs" / "relief.toml").read_text(encoding="utf-8")
 POSES = """carries_calibration = false
 [head.poses]
 count = 20

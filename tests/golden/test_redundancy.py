@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import pytest
 
-from slrig.cli.scan import quality_lines
+from slrig.cli.display import quality_lines
 from slrig.model import FloatArray
-from slrig.scan.job import report_summary
+from slrig.scan.artefacts import report_summary
 from tests.golden.conftest import Scan
 from tests.golden.test_bundles import reconstructed
 

@@ -20,6 +20,7 @@ from slrig.cli import local
 from slrig.cli.commands import app
 from slrig.config import read_rig
 from slrig.devices import CameraSettings, Rig, Turntable
+from slrig.examples import EXAMPLES
 from slrig.jobs.listener import SILENT
 from slrig.model import MeasuredAxis, PlaneKind, RotationAxis
 from slrig.model_jobs.combining import read_mesh
@@ -33,7 +34,6 @@ from tests.turned_views import displacement_mm
 
 pytestmark = pytest.mark.slow
 
-CONFIG = Path(__file__).parents[2] / "config"
 BOARD_ANGLES = (-50.0, -30.0, -10.0, 10.0, 30.0, 50.0)
 BOARD = ["--board", "charuco", "--corners", "6x4", "--square-mm", "26", "--marker-mm", "20"]
 BOARD += ["--dictionary", "DICT_4X4_50"]
@@ -81,7 +81,7 @@ def test_the_axis_is_found_from_a_board_at_six_angles(tmp_path: Path, monkeypatc
     with board_rig(head, options) as rig:
         monkeypatch.setattr(local, "open_rig", lambda _config: rig)
         board = Board(BoardKind.CHARUCO, 6, 4, 26.0, 20.0, "DICT_4X4_50")
-        record = local.run_job(read_rig(CONFIG / "rigs" / "plane.toml"), AxisJob(board), SILENT)
+        record = local.run_job(read_rig(EXAMPLES / "rigs" / "plane.toml"), AxisJob(board), SILENT)
     shot = (record.summary or {})["axis"]
     again = MeasuredAxis(*(np.array(shot[name]) for name in ("point_mm", "direction", "covariance")))
     is_the_axis(again, axis)
@@ -138,7 +138,7 @@ def scanned(
     """Scans of a scene whose wall stands still, by the rig of the figure on a turntable; each has its bundle in it."""
     folder.mkdir(exist_ok=True)
     (folder / "scene.toml").write_text(scene)
-    options: dict[str, Any] = tomllib.loads((CONFIG / "rigs" / "turntable.toml").read_text())["head"]
+    options: dict[str, Any] = tomllib.loads((EXAMPLES / "rigs" / "turntable.toml").read_text())["head"]
     del options["driver"]
     options |= {"scene": "scene.toml", **devices.get("head", {})}
     turned = [each["name"] for each in tomllib.loads(scene)["object"] if each["name"] != "wall"]

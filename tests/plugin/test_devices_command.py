@@ -50,6 +50,13 @@ def test_a_command_to_copy_is_neither_wrapped_nor_styled_away(monkeypatch: pytes
     assert "slrig demo" in shown.replace("\n", " ")
 
 
+def test_it_says_which_devices_it_looks_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    drivers = (driver("v4l2", "slrig", kind="finder"), driver("gone", "slrig", kind="finder", fault="no library"))
+    monkeypatch.setattr(devices, "installed_drivers", lambda: drivers)
+    monkeypatch.setattr(devices, "discover_devices", lambda: DiscoveredDevices((), (), ()))
+    assert CliRunner().invoke(app, ["devices"]).stderr.startswith("Looking for devices of v4l2 …")
+
+
 def test_a_broken_package_is_listed_once_with_its_cause_and_its_removal(monkeypatch: pytest.MonkeyPatch) -> None:
     faults = {kind: f"{kind} driver 'x' cannot be loaded: OSError: [/etc] is shut" for kind in ("camera", "finder")}
     drivers = tuple(driver("x", "x-package", kind=kind, fault=fault) for kind, fault in faults.items())

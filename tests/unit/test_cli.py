@@ -33,10 +33,9 @@ from slrig.calibration.artefacts import Decision
 from slrig.cli import accept as accepting
 from slrig.cli.accept import Person, measure_positions, moving, plan_for
 from slrig.cli.commands import INTERRUPTED, app
-from slrig.cli.display import ProgressDisplay, print_json, print_table
+from slrig.cli.display import ProgressDisplay, print_json, print_table, quality_lines
 from slrig.cli.options import AcceptanceOptions, ServiceOptions
 from slrig.cli.scan import (
-    quality_lines,
     remove_earlier,
     require_sound,
     scan_with,
@@ -49,18 +48,19 @@ from slrig.config import read_rig
 from slrig.devices import Rig
 from slrig.discovery import open_rig
 from slrig.errors import InvalidInputError, ScanCancelledError, ServiceError, SlrigError, UnsupportedByDeviceError
+from slrig.examples import EXAMPLES
 from slrig.jobs.listener import SILENT, Listener
 from slrig.jobs.manager import JobManager
 from slrig.model import Region
+from slrig.scan.artefacts import report_summary
 from slrig.scan.formats import MEDIA_TYPES
-from slrig.scan.job import report_summary
 from slrig.scan.report import sigma_words
 from tests.unit.capture.fake_rig import fake_rig
 from tests.unit.client.service import SCAN, Walk, client_of, failing
 from tests.unit.command import done, refused, slrig
 
 COLUMNS = 80
-DEMO = Path(__file__).parents[2] / "config" / "rigs" / "demo.toml"
+DEMO = EXAMPLES / "rigs" / "demo.toml"
 SUMMARY = {
     "identity": "28/28 patterns verified, 2 frames shot again",
     "mesh": {"figures": {"vertices": 1200, "triangles": 2301}, "sigma_mm": {"p50": 0.0079}},
@@ -163,6 +163,17 @@ def test_error_of_ours_is_one_screen_and_exit_code_2(tmp_path: Path) -> None:
     ):
         result = slrig("reconstruct", tmp_path, *out, option, value)
         assert (result.exit_code, words_ in result.stderr) == (2, True), result.stderr
+
+
+def test_files_of_an_earlier_scan_are_not_overwritten_unless_told(tmp_path: Path) -> None:
+    nowhere = ("scan", "--url", "http://127.0.0.1:9", "--output", tmp_path)
+    (tmp_path / "mesh.ply").write_text("earlier")
+    assert "has mesh.ply of an earlier scan" in refused(slrig(*nowhere))
+    assert "earlier scan" not in refused(slrig(*nowhere, "--force"))
+    assert "earlier scan" not in refused(slrig(*nowhere, "--file", "mesh.stl"))
+    assert (tmp_path / "mesh.ply").read_text() == "earlier"
+    (tmp_path / "001").mkdir()
+    assert "has 001 of an earlier scan" in refused(slrig(*nowhere, "--file", "mesh.stl", "--repeat", "2"))
 
 
 def test_interruption_is_exit_code_130(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -521,7 +532,7 @@ def test_label_of_an_older_record_does_nothing_to_the_terminal(capsys: pytest.Ca
     assert json.loads("{" + document) == {"label": label}
 
 
-RIGS = Path(__file__).parents[2] / "config" / "rigs"
+RIGS = EXAMPLES / "rigs"
 BALL_BAR = RIGS / "ball_bar.toml"
 
 

@@ -19,6 +19,7 @@ from slrig.config import RigConfig, read_rig
 from slrig.devices import Camera, FoundDevice, Projector
 from slrig.discovery import DiscoveredDevices, MissingLibrary, open_rig
 from slrig.errors import DriverBrokenError
+from slrig.examples import EXAMPLES
 from tests.unit import test_discovery
 from tests.unit.command import slrig
 
@@ -257,7 +258,7 @@ def test_a_rig_of_drivers_that_describe_nothing_opens(
         assert [dict(each.options) for each in test_discovery.OPENED] == [{"device": "usb-2"}, {"device": "usb-1"}]
 
 
-RIGS = sorted((Path(__file__).resolve().parents[2] / "config" / "rigs").glob("*.toml"))
+RIGS = sorted((EXAMPLES / "rigs").glob("*.toml"))
 HERE = __name__
 DECLARED = f"""
 [slrig.cameras]

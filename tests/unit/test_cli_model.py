@@ -27,6 +27,7 @@ from slrig.cli import model_shoot
 from slrig.client.connection import Progress
 from slrig.devices import Rig
 from slrig.errors import ConfigError, DeviceGoneError, ServiceError
+from slrig.examples import EXAMPLES
 from slrig.model import MeasuredAxis, PlaneKind, TurntablePlane
 from slrig.model_jobs import plan
 from slrig.model_jobs.turntable import with_axis
@@ -212,7 +213,7 @@ def test_scans_of_unknown_places_are_placed_and_a_vase_is_refused(scans: Path, t
 
 
 TABLE = ["--axis-point", *map(str, AXIS_POINT_MM), "--axis-direction", *map(str, AXIS)]
-RIG = Path(__file__).parents[2] / "config" / "rigs" / "demo.toml"
+RIG = EXAMPLES / "rigs" / "demo.toml"
 
 
 class Bench:

@@ -15,6 +15,7 @@ from slrig.cli.rig_file import failure_of
 from slrig.config import RigConfig, is_loopback, read_rig, read_settings
 from slrig.discovery import drivers_with_options
 from slrig.errors import ConfigError
+from slrig.examples import EXAMPLES
 from slrig.model import FlipRule
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 
@@ -183,8 +184,7 @@ def test_an_open_service_is_allowed_on_this_machine(host: str) -> None:
 # ---- The rig files that we ship for live devices, and what config/README.md says about rig files
 
 
-CONFIG = Path(__file__).resolve().parents[2] / "config"
-README = (CONFIG / "README.md").read_text(encoding="utf-8")
+README = (Path(__file__).resolve().parents[2] / "config" / "README.md").read_text(encoding="utf-8")
 LIVE = {
     "webcams-and-hdmi": ("screen", ["v4l2", "v4l2"]),
     "oak-and-screen": ("screen", ["depthai", "depthai"]),
@@ -205,19 +205,19 @@ def taken_by_its_drivers(path: Path) -> RigConfig:
     return rig
 
 
-@pytest.mark.parametrize("path", sorted((CONFIG / "rigs").glob("*.toml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted((EXAMPLES / "rigs").glob("*.toml")), ids=lambda path: path.stem)
 def test_every_rig_file_is_taken_by_its_drivers(path: Path) -> None:
     taken_by_its_drivers(path)
 
 
 @pytest.mark.parametrize("name", LIVE)
 def test_the_usual_kits_have_a_rig_file_with_comments(name: str) -> None:
-    path = CONFIG / "rigs" / f"{name}.toml"
+    path = EXAMPLES / "rigs" / f"{name}.toml"
     rig = taken_by_its_drivers(path)
     assert rig.name == name
     assert rig.projector is not None
     assert (rig.projector.driver, [camera.driver for camera in rig.cameras]) == LIVE[name]
-    assert f"(rigs/{name}.toml)" in README
+    assert f"/rigs/{name}.toml)" in README
     lines = path.read_text(encoding="utf-8").splitlines()
     assert lines[0] == "#:schema ../schema.json"
     assert (path.parent / "../schema.json").is_file()
@@ -231,7 +231,7 @@ def test_the_usual_kits_have_a_rig_file_with_comments(name: str) -> None:
 
 def test_commented_lines_of_a_rig_file_are_valid(tmp_path: Path) -> None:
     for name in LIVE:
-        text = (CONFIG / "rigs" / f"{name}.toml").read_text(encoding="utf-8")
+        text = (EXAMPLES / "rigs" / f"{name}.toml").read_text(encoding="utf-8")
         used = re.sub(r"^# ((?:\[\w+\]|\w+ = ).*)$", r"\1", text, flags=re.MULTILINE)
         assert used != text
         (tmp_path / "rig.toml").write_text(used, encoding="utf-8")

@@ -8,12 +8,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from slrig.examples import EXAMPLES
 from tests.e2e.readmes.person import USUAL_ADDRESS, Person
 
 RENDERED = "rendered.toml"
 """In the fresh folder: a rendered rig that moves the default board by itself, in place of devices."""
 
-_CALIBRATED = "config/rigs/rendered-calibration.toml"
+_CALIBRATED = "rendered-calibration"
 
 _SMALLER = (
     ("samples_per_axis = 2", "samples_per_axis = 1"),
@@ -79,13 +80,13 @@ STAND_INS = (
         "a person puts an artefact before the rig 23 times",
     ),
     StandIn(
-        "slrig accept config/rigs/rendered-acceptance.toml --output rendered-acceptance --scripted",
+        "slrig accept rendered-acceptance --output rendered-acceptance --scripted",
         None,
         "29 captures take as long as all other commands together; tests/e2e/test_acceptance_walk.py makes smaller ones",
     ),
     StandIn(
         "slrig scan --coloured-light --file bundle.zip --output board",
-        "slrig demo config/rigs/plane.toml --output board",
+        "slrig demo plane --output board --data board/service",
         "a person puts a white board before a calibrated rig; a rendered plate takes its place",
     ),
     StandIn(
@@ -95,8 +96,8 @@ STAND_INS = (
     ),
     StandIn(
         "slrig import teapot --projector 1024x768 --output teapot-bundle",
-        "mkdir teapot && sed '2a [scan]\\nline_shift = false\\ngray_cell_px = 2' config/rigs/demo.toml "
-        "> config/rigs/codes.toml && slrig demo config/rigs/codes.toml --output codes "
+        "mkdir teapot && sed '2a [scan]\\nline_shift = false\\ngray_cell_px = 2' demo "
+        "> codes.toml && slrig demo codes.toml --output codes --data codes/service "
         "&& cp codes/service/scans/*/bundle/frames/left/00?.png codes/service/scans/*/bundle/frames/left/01[0-5].png "
         "codes/service/scans/*/bundle/calibration.json teapot "
         "&& slrig import teapot --projector 256x192 --camera left --yes --output teapot-bundle",
@@ -163,21 +164,31 @@ def _halved(extent: re.Match[str]) -> str:
     return f"{extent[1]}[{', '.join(halves)}]"
 
 
+def _example(name: str) -> str:
+    """The rig file of an example, for any folder."""
+    text = (EXAMPLES / "rigs" / f"{name}.toml").read_text(encoding="utf-8")
+    return text.replace("../scenes", f"{EXAMPLES}/scenes")
+
+
 def lay_out_rigs(folder: Path) -> None:
-    """Make the rigs that are scanned and calibrated smaller, and write the rendered rig of the stand-ins."""
+    """Write smaller rigs under the names of examples that are scanned and calibrated, and the stand-ins' rendered rig.
+
+    A file comes before the example of its name.
+    """
     for each, halvings in (("demo", 2), ("plane", 1)):
-        rig = folder / "config" / "rigs" / f"{each}.toml"
-        smaller = rig.read_text(encoding="utf-8")
+        smaller = _example(each)
         for _ in range(halvings):
             smaller, count = _EXTENTS.subn(_halved, smaller)
             assert count == 6, smaller
-        rig.write_text(re.sub(r"samples_per_axis = \d", "samples_per_axis = 1", smaller), encoding="utf-8")
-    small = (folder / _CALIBRATED).read_text(encoding="utf-8")
+        (folder / each).write_text(re.sub(r"samples_per_axis = \d", "samples_per_axis = 1", smaller), encoding="utf-8")
+    small = _example(_CALIBRATED)
     for old, new in _SMALLER:
         assert old in small, old
         small = small.replace(old, new)
     (folder / _CALIBRATED).write_text(small, encoding="utf-8")
-    bench = small.replace("../scenes/charuco_board.toml", "board.toml").replace("rendered-calibration", "bench", 1)
+    bench = small.replace(f"{EXAMPLES}/scenes/charuco_board.toml", "board.toml").replace(
+        "rendered-calibration", "bench", 1
+    )
     (folder / RENDERED).write_text(bench, encoding="utf-8")
-    board = (folder / "config" / "scenes" / "charuco_board.toml").read_text(encoding="utf-8")
+    board = (EXAMPLES / "scenes" / "charuco_board.toml").read_text(encoding="utf-8")
     (folder / "board.toml").write_text(board.replace("14.0", "12.0").replace("10.5", "9.0"), encoding="utf-8")

@@ -6,7 +6,6 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from simulated_rig.options import HeadOptions
 from simulated_rig.rendering import CameraView, SceneState
 from simulated_rig.scene import Scene, build_surface
 from slrig.calibration.board import Board, BoardKind
+from slrig.examples import EXAMPLES
 from slrig.model import CameraFormat, CameraTruth, Capture, FloatArray, Pattern, Shot, Size
 from slrig.patterns.sequence import encode, scan_patterns
 from tests.light_bound import ExposedView
@@ -23,7 +23,7 @@ BOARD = Board(BoardKind.CHESSBOARD, 8, 5, 18.0)
 ROTATION_DEG = (16.0, -12.0, 6.0)
 POSITION_MM = (6.0, 2.0, 20.0)
 
-_RIG = Path(__file__).parents[3] / "config" / "rigs" / "rendered-calibration.toml"
+_RIG = EXAMPLES / "rigs" / "rendered-calibration.toml"
 _SCALE = 0.3
 _PERIOD_PX = 8
 _WHITE = 0.85

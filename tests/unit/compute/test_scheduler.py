@@ -40,6 +40,7 @@ from slrig.compute.link import (
 from slrig.compute.scheduler import Scheduler, serve_scheduler
 from slrig.compute.security import KEY, MEMBER, PoolAddress, pool_address
 from slrig.errors import ConfigError, ServiceError, StorageError
+from slrig.examples import EXAMPLES
 from slrig.failure import JobFailure
 from tests.core import parametrize_core
 from tests.unit.command import slrig
@@ -103,7 +104,7 @@ def test_certificates_are_made_in_folders_that_can_be_for_names_of_machines(tmp_
 
 def test_a_service_with_a_pool_needs_a_store(tmp_path: Path) -> None:
     for options in (["--compute", "tls://127.0.0.1:1"], ["--store", "s3://scans"]):
-        rig = Path(__file__).parents[3] / "config" / "rigs" / "demo.toml"
+        rig = EXAMPLES / "rigs" / "demo.toml"
         told = slrig("serve", rig, "--data", tmp_path / "data", "--port", "0", *options)
         assert (told.exit_code, "needs a store as well" in told.stderr) == (2, True), told.output
     told = slrig("worker", "--scheduler", "tls://127.0.0.1:1")

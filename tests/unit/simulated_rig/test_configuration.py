@@ -10,9 +10,10 @@ import pytest
 
 from simulated_rig.device import open_head, open_simulated_head
 from slrig.errors import ConfigError
+from slrig.examples import EXAMPLES
 from tests.unit.simulated_rig.building import FACING_PLATE, coarser, head_options, small_head
 
-RIGS = sorted((Path(__file__).parents[3] / "config" / "rigs").glob("*.toml"))
+RIGS = sorted((EXAMPLES / "rigs").glob("*.toml"))
 RENDERED = [path for path in RIGS if tomllib.loads(path.read_text()).get("head", {}).get("driver") == "simulated"]
 
 
