@@ -547,7 +547,10 @@ class Access:
                 refusal = too_many
         elif caller is not None and refusal.noted:
             await self._note(caller.name, address, method, path, refusal.status, "")
-        response = answer(problem(refusal.status, refusal.code, str(refusal)), headers=refusal.headers)
+        response: Response = answer(problem(refusal.status, refusal.code, str(refusal)), headers=refusal.headers)
+        if refusal.status == 401 and method == "GET" and "text/html" in Headers(scope=scope).get("accept", ""):
+            # Somebody with a browser, who can log in at the page.
+            response = RedirectResponse("/", status_code=303)
         await response(scope, receive, send)
 
     async def _note(self, name: str, address: str, method: str, path: str, status: int, made: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 from collections.abc import Mapping, Sequence
 from http import HTTPStatus
@@ -11,13 +12,14 @@ from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.openapi.utils import get_openapi
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from slrig.api.scopes import needed_scope
+from slrig.bundle import model_keys
 from slrig.errors import RigBusyError, SlrigError
 from slrig.failure import UNEXPECTED, JobFailure, errors_by_code
 from slrig.printable import printable
@@ -184,10 +186,12 @@ async def _slrig_error(_request: Request, error: Exception) -> JSONResponse:
     return answer(document, headers=None if wait_s is None else {"Retry-After": str(wait_s)})
 
 
-async def _invalid_request(_request: Request, error: Exception) -> JSONResponse:
+async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
     if not isinstance(error, RequestValidationError):
         raise error
-    found = field_faults(error.errors())
+    body = getattr(request.scope.get("route"), "body_field", None)
+    known = () if body is None else model_keys(TypeAdapter(body.field_info.annotation))
+    found = field_faults(error.errors(), known)
     names = ", ".join(fault["field"] for fault in found)
     noun = "fault" if len(found) == 1 else "faults"
     detail = f"The request has {len(found)} {noun}: {names}. See errors."
@@ -216,18 +220,24 @@ async def _unexpected(_request: Request, error: Exception) -> JSONResponse:
     return answer(problem(500, UNEXPECTED, detail))
 
 
-def field_faults(found: Sequence[Any]) -> list[dict[str, Any]]:
-    """What pydantic found, as the `errors` of a problem. What was sent is shown only where it is short."""
-    return [_field_fault(entry) for entry in found]
+def field_faults(found: Sequence[Any], known: Sequence[str] = ()) -> list[dict[str, Any]]:
+    """What pydantic found, as the `errors` of a problem. What was sent is shown only where it is short.
+
+    known : names of fields, of which the nearest is proposed for a misspelt one.
+    """
+    return [_field_fault(entry, known) for entry in found]
 
 
-def _field_fault(entry: Any) -> dict[str, Any]:
+def _field_fault(entry: Any, known: Sequence[str]) -> dict[str, Any]:
     if entry["type"] == "json_invalid":
         message = f"is no JSON: {entry['ctx']['error']} at character {entry['loc'][-1]}"
         return {"field": "body", "message": message}
     place = [printable(str(part)) for part in entry["loc"] if part != "body"]
     sent = entry.get("input")
     message = printable(_MESSAGES.get(entry["type"], entry["msg"]))
+    near = difflib.get_close_matches(place[-1], known, n=1) if place and entry["type"] == "extra_forbidden" else []
+    if near:
+        message = f"There is no such field here; did you mean '{near[0]}'?"
     fault: dict[str, Any] = {"field": ".".join(place) or "body", "message": message}
     if isinstance(sent, str) and len(sent) <= 80:
         fault["found"] = printable(sent)

@@ -22,6 +22,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    TypeAdapter,
     ValidationError,
     field_validator,
 )
@@ -222,9 +223,9 @@ def describe_errors(cause: ValidationError, data: object, known_keys: Sequence[s
     return "\n".join(lines)
 
 
-def model_keys(model: type[BaseModel]) -> tuple[str, ...]:
+def model_keys(model: type[BaseModel] | TypeAdapter[Any]) -> tuple[str, ...]:
     """Every key of a model and of the models in it, for proposals."""
-    schema = model.model_json_schema()
+    schema = model.json_schema() if isinstance(model, TypeAdapter) else model.model_json_schema()
     return tuple(dict.fromkeys(_properties(schema)))
 
 

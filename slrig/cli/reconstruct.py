@@ -17,17 +17,15 @@ import typer
 from rich.table import Column
 
 from slrig.bundle import DESCRIPTION, natural_sort_key, read_calibration, read_description, write_file
-from slrig.cli.display import ProgressDisplay, counted, print_table, progress_shown
-from slrig.cli.scan import quality_lines
+from slrig.cli.display import ProgressDisplay, counted, print_table, progress_shown, quality_lines
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError, ExtraMissingError
 from slrig.failure import UNEXPECTED, job_failure
 from slrig.jobs.listener import Listener
 from slrig.jobs.worker import PREPARING, prepare_kernel_cache
 from slrig.logs import set_up_console_logs
-from slrig.scan.artefacts import MESH, ON_REQUEST, REPORT, write_converted
+from slrig.scan.artefacts import MESH, ON_REQUEST, REPORT, report_summary, write_converted
 from slrig.scan.formats import BUNDLE_ZIP, CALIBRATION_USED, missing_for, offered, on_demand
-from slrig.scan.job import report_summary
 from slrig.scan.plan import ReconstructionPlan
 
 Row = tuple[str, ...]
@@ -336,8 +334,13 @@ def warm() -> None:
     began_s = time.monotonic()
     with progress_shown() as display:
         count = prepare_kernels(display)
+    # numba: a second.
+    from slrig.kernels import why_compiled
+
     place = os.environ.get("NUMBA_CACHE_DIR") or "beside slrig's own files"
-    typer.echo(f"{count} kernels are ready, kept {place} ({time.monotonic() - began_s:.0f} s)")
+    why = why_compiled()
+    kept = "as they came with slrig" if why is None else f"kept {place}; compiled here, because {why}"
+    typer.echo(f"{count} kernels are ready, {kept} ({time.monotonic() - began_s:.0f} s)")
 
 
 def prepare_kernels(display: ProgressDisplay) -> int:

@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, IntArray
@@ -112,8 +110,10 @@ def open_borders(points_mm: NDArray[np.floating[Any]], faces: IntArray) -> OpenB
     if not len(face):
         return OpenBorders(0, np.zeros(0), np.zeros(0))
     begin, end = faces[face, (corner + 1) % 3], faces[face, (corner + 2) % 3]
-    graph = coo_matrix((np.ones(len(begin)), (begin, end)), shape=(len(points_mm),) * 2)
-    loop = np.unique(connected_components(graph, directed=False)[1][begin], return_inverse=True)[1].ravel()
+    # Each edge as a face without area.
+    edges = np.column_stack((begin, end, end)).astype(np.int32)
+    roots = _component_roots(edges, np.ones(len(edges), dtype=np.bool_), len(points_mm))
+    loop = np.unique(roots[begin], return_inverse=True)[1].ravel()
     # Near the origin, to avoid cancellation: the sum over a closed loop does not depend on it.
     points = points_mm.astype(np.float64) - points_mm[begin].mean(axis=0, dtype=np.float64)
     across = np.cross(points[begin], points[end]) / 2

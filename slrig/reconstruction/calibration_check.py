@@ -19,11 +19,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
+import cv2
 import numpy as np
 from numpy import linalg
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from slrig.model import Axis, FloatArray, Gray, LineShift, Pinhole, Size, from_gray, to_gray
 from slrig.reconstruction.identification import StripeEnsemble
@@ -500,7 +499,7 @@ def _turned(projector: Pinhole, camera: Pinhole, turn: FloatArray, aside: FloatA
     _, _, across = linalg.svd(baseline[None])
     moved = baseline / length + aside @ across[1:]
     centre = camera.centre_mm + length * moved / linalg.norm(moved)
-    rotation = Rotation.from_rotvec(turn).as_matrix() @ projector.rotation
+    rotation = np.asarray(cv2.Rodrigues(turn)[0]) @ projector.rotation
     return replace(projector, rotation=rotation, translation_mm=-rotation @ centre)
 
 
@@ -524,6 +523,9 @@ def fit_calibration(camera: Pinhole, projector: Pinhole, pairs: PixelPairs, /) -
 
     None if no small change brings the points in front of both devices.
     """
+    # Half a second to load, and few scans need it.
+    from scipy.optimize import least_squares
+
     pairs = pairs.thinned(_FIT_POINTS)
     scale = _OUTLIER_SIGMA * max(0.1, float(np.median(pairs.sigma_px)))
     found = None
@@ -767,6 +769,8 @@ def _other_focal_lengths(
 
 def _minimise(residual: Callable[[FloatArray], FloatArray], starts: Sequence[FloatArray]) -> FloatArray:
     """The parameters of the least robust sum, from the three best of several starts."""
+    # Half a second to load, and few scans need it.
+    from scipy.optimize import least_squares
 
     def error(x: FloatArray) -> FloatArray:
         return np.concatenate([np.nan_to_num(residual(x), nan=1e3), 1e-3 * x])

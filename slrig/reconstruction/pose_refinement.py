@@ -12,9 +12,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from slrig.model import DEVICE_PARAMETERS, Axis, FloatArray, Pinhole
 from slrig.reconstruction.identification import StripeEnsemble
@@ -88,6 +87,9 @@ def refine_pose(
     ensembles : stripes of each camera; moved : index of the device, len(cameras) for the projector; pairs : indices of
     two cameras each, of which one is `moved` unless that is the projector; widest_gap_px : as for `merge_curves`.
     """
+    # Half a second to load, and few scans need it.
+    from scipy.optimize import least_squares
+
     devices = [*cameras, projector]
     others = [projector] if moved < len(cameras) else [cameras[k] for pair in pairs for k in pair]
     baseline_mm = min(float(np.linalg.norm(devices[moved].centre_mm - each.centre_mm)) for each in others)
@@ -171,7 +173,7 @@ def _is_small(turn: FloatArray, shift_mm: FloatArray, baseline_mm: float, *, fac
 
 def _moved(device: Pinhole, motion: FloatArray) -> Pinhole:
     """The device turned about its centre by a rotation vector, rad, and shifted, mm, (6,), in its own frame."""
-    rotation = Rotation.from_rotvec(motion[:3]).as_matrix() @ device.rotation
+    rotation = np.asarray(cv2.Rodrigues(motion[:3])[0]) @ device.rotation
     centre_mm = device.centre_mm + device.rotation.T @ motion[3:]
     return Pinhole(device.size, device.matrix, device.distortion, rotation, -rotation @ centre_mm)
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import DEVICE_PARAMETERS, Axis, Calibration, FloatArray, IntArray, Pinhole, Refusal, Size, Source
@@ -363,7 +363,7 @@ def _with_parameter(device: Pinhole, parameter: int, step: float) -> Pinhole:
         turn[parameter - 9] = step
     else:
         shift[parameter - 12] = step
-    rotation = Rotation.from_rotvec(turn).as_matrix() @ device.rotation
+    rotation = np.asarray(cv2.Rodrigues(turn)[0]) @ device.rotation
     return Pinhole(device.size, matrix, distortion, rotation, device.translation_mm + shift)
 
 

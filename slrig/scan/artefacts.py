@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from slrig.bundle import stored_json, sync_folder, sync_tree, write_file
 from slrig.disk import staging_name, storage_errors
 from slrig.errors import InvalidInputError
+from slrig.jobs.records import STAGES_S
 from slrig.model import FloatArray, IntArray, Mesh, PointCurves
 from slrig.scan.formats import encode_coarse_glb, encode_mesh_3mf, encode_mesh_obj, encode_mesh_stl, encode_view_glb
 
@@ -361,3 +362,28 @@ def truth_notes(truth: Mapping[str, Any]) -> list[str]:
     if facing is not None and facing < 1 - _MAX_SHARE:
         notes.append(f"{1 - facing:.1%} of the area shows every camera its back: it is inside out, or no surface")
     return notes
+
+
+def report_summary(report: Mapping[str, Any]) -> dict[str, Any]:
+    """The part of a report that is worth a row in a list: its plain values, and the whole of "truth", "mesh",
+    "notes", "turntable" (its angle), "computed", and the seconds of each stage of the work.
+
+    >>> report_summary({"method": "Gray-only", "stages": {"decode": 0.1}, "truth": {"rms_mm": float("nan")}})
+    {'method': 'Gray-only', 'truth': {'rms_mm': None}}
+    """
+    return {
+        name: _finite(value)
+        for name, value in report.items()
+        if name in {"truth", "mesh", "notes", "turntable", "computed", STAGES_S}
+        or value is None
+        or isinstance(value, (bool, int, float, str))
+    }
+
+
+def _finite(value: Any) -> Any:
+    """The value with null for every number that JSON has no form for."""
+    if isinstance(value, Mapping):
+        return {name: _finite(each) for name, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

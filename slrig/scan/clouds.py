@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from slrig.bundle import CALIBRATION, BundleFiles, open_bundle, read_calibration, read_description, stored_json
 from slrig.disk import storage_errors
@@ -310,6 +309,9 @@ def encode_pcd(cloud: OrganisedCloud) -> bytes:
     Points are in the world. VIEWPOINT is the camera there: its centre, mm, and the rotation from its axes to the
     world's as a quaternion, w x y z.
     """
+    # Most of a second to load, and few scans are asked for as PCD.
+    from scipy.spatial.transform import Rotation
+
     high, wide = cloud.cause.shape
     x, y, z, w = Rotation.from_matrix(cloud.device.rotation.T).as_quat(canonical=True)
     count = len(POINT_FIELDS)

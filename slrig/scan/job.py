@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,12 +16,12 @@ from slrig.errors import JobNotFoundError, NotCalibratedError
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.job import Job, JobRun, Outcome, Recording
 from slrig.jobs.manager import JobManager
-from slrig.jobs.records import STAGES_S, JobKind, JobRecord, utc_now
+from slrig.jobs.records import JobKind, JobRecord, utc_now
 from slrig.jobs.store import JobStore
 from slrig.model import Region
 from slrig.rig.session import RigSession
 from slrig.scan.acquisition import capture_frames
-from slrig.scan.artefacts import MESH, REPORT
+from slrig.scan.artefacts import MESH, REPORT, report_summary
 from slrig.scan.plan import ScanPlan, check_plan, series_of
 
 _plan_adapter = TypeAdapter(ScanPlan)
@@ -41,31 +40,6 @@ def plan_json(plan: ScanPlan) -> dict[str, Any]:
 def plan_from_json(document: Mapping[str, Any]) -> ScanPlan:
     """The inverse of `plan_json`."""
     return _plan_adapter.validate_python(document)
-
-
-def report_summary(report: Mapping[str, Any]) -> dict[str, Any]:
-    """The part of a report that is worth a row in a list: its plain values, and the whole of "truth", "mesh",
-    "notes", "turntable" (its angle), "computed", and the seconds of each stage of the work.
-
-    >>> report_summary({"method": "Gray-only", "stages": {"decode": 0.1}, "truth": {"rms_mm": float("nan")}})
-    {'method': 'Gray-only', 'truth': {'rms_mm': None}}
-    """
-    return {
-        name: _finite(value)
-        for name, value in report.items()
-        if name in {"truth", "mesh", "notes", "turntable", "computed", STAGES_S}
-        or value is None
-        or isinstance(value, (bool, int, float, str))
-    }
-
-
-def _finite(value: Any) -> Any:
-    """The value with null for every number that JSON has no form for."""
-    if isinstance(value, Mapping):
-        return {name: _finite(each) for name, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 _NOT_CALIBRATED = (

@@ -651,6 +651,8 @@ def test_the_description_is_a_page_of_our_own(client: TestClient, served: Served
         assert f"/docs/{part}" in page
         assert client.get(f"/docs/{part}").status_code == 200
         assert stranger(served).get(f"/docs/{part}").status_code == 401
+    led = stranger(served).get("/docs", headers={"Accept": "text/html,*/*"}, follow_redirects=False)
+    assert (led.status_code, led.headers["location"]) == (303, "/")
 
 
 def test_damaged_file_of_keys_is_a_storage_problem(client: TestClient, served: ServedBench) -> None:

@@ -10,6 +10,8 @@ import threading
 import zipfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -48,7 +50,7 @@ from tests.unit.capture.fake_rig import CameraFaults, fake_rig
 from tests.unit.command import done, refused, slrig
 from tests.unit.jobs.tame_compute import TameCompute
 from tests.unit.scan import fake_pipeline
-from tests.unit.scan.fakes import WAIT_S
+from tests.unit.scan.fakes import WAIT_S, tame_calibration
 
 
 def events_of(text: str) -> list[dict[str, Any]]:
@@ -558,7 +560,9 @@ class FaultyBench(ServedBench):
     """Captures on a rig in memory, whose camera spoils every line frame."""
 
     def __init__(self, root: Path) -> None:
-        self.rig = fake_rig(faults={"right": CameraFaults(garbled=frozenset(range(13, 1000)))}).rig
+        rig = fake_rig(faults={"right": CameraFaults(garbled=frozenset(range(13, 1000)))}).rig
+        # The calibration of other cameras: nothing is reconstructed.
+        self.rig = replace(rig, calibration=tame_calibration())
         super().__init__(root)
 
     def open_rig(self) -> Rig:
@@ -570,7 +574,9 @@ class FaultyBench(ServedBench):
 
 @pytest.mark.slow
 def test_scan_whose_frames_fail_gives_them_and_leaves_the_rig_free(tmp_path: Path) -> None:
-    with client_of(FaultyBench(tmp_path)) as client:
+    bench = FaultyBench(tmp_path)
+    with ExitStack() as patched, client_of(bench) as client:
+        patched.callback(bench.unpatch)
         scan = ended(client, client.post("/scan").json()["id"])
         assert (scan["state"], scan["error"]["type"]) == ("failed", "/problems/scan-evidence")
         assert "camera 'right', pattern 11" in scan["error"]["detail"]
