@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 from pydantic import AfterValidator, ConfigDict, Field, SecretStr, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, EnvSettingsSource, NoDecode, SettingsConfigDict
 
+from slrig import data_home
 from slrig.bundle import (
     CameraName,
     ExposureSeconds,
@@ -239,12 +240,6 @@ def parse_rig(data: Mapping[str, Any], path: Path) -> RigConfig:
     )
 
 
-def default_data_dir() -> Path:
-    """Default folder for scans: in the data folder of the XDG base directories."""
-    base = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
-    return Path(base) / "slrig"
-
-
 def _require_web_address(url: str) -> str:
     try:
         parts = urlsplit(url)
@@ -291,7 +286,7 @@ class ServiceSettings(BaseSettings):
 
     host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 8731
-    data_dir: Path = Field(default_factory=default_data_dir)
+    data_dir: Path = Field(default_factory=data_home)
     data_group: Annotated[str, Field(min_length=1)] | None = None
     rig: Path | None = None
     require_key: bool = True

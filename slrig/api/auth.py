@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import math
+import os
 import re
 import secrets
 import time
@@ -30,7 +31,7 @@ from starlette.middleware.body_limit import RequestBodyLimitMiddleware
 from starlette.requests import cookie_parser
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from slrig import KEY_VARIABLE
+from slrig import KEY_VARIABLE, local_key_path
 from slrig.api.calibration import IMPORT_PATH
 from slrig.api.problems import answer, problem, problems
 from slrig.api.scopes import READING, KeyScope, moves, needed_scope
@@ -49,12 +50,15 @@ FIRST_NAME = "owner"
 """Whom the key belongs to that the service makes at its first start."""
 
 GIVEN_NAME = "environment"
+LOCAL_NAME = "local"
 """Whom the key of the environment belongs to."""
 
 KEY_NAME = r"^[A-Za-z0-9][A-Za-z0-9 ._@-]{0,63}$"
 
 
 ALL_SCOPES = tuple(KeyScope)
+_TAKEN = {GIVEN_NAME, LOCAL_NAME}
+"""Names of keys that are in no file."""
 
 
 class Key(Strict):
@@ -105,6 +109,7 @@ class KeyRing:
         self._path = path
         self._clock = clock
         self._given = None if given is None else _given_key(given, clock())
+        self._local: Key | None = None
         self._seen: tuple[int, int, int] | None = None
         self._by_digest: dict[str, Key] = {}
         self._look()
@@ -115,8 +120,14 @@ class KeyRing:
 
     def by_digest(self, identity: str) -> Key | None:
         """The key of a digest, which is its identity: a name may pass on to another key."""
+        if self._local is not None and self._local.digest == identity:
+            return self._local
         self._look()
         return self._by_digest.get(identity)
+
+    def admit(self, key: str) -> None:
+        """Let in those who send this key, which is kept nowhere, as long as this process runs: see `local_key`."""
+        self._local = Key(name=LOCAL_NAME, digest=digest(key), scopes=ALL_SCOPES, created_at=self._clock())
 
     def named(self, name: str) -> Key | None:
         """The newest key of a name."""
@@ -148,7 +159,7 @@ class KeyRing:
             expires_at=None if life is None else now + life,
         )
         with self._changing() as keys:
-            if any(each.name == name and each.fault(now) is None for each in keys) or name == GIVEN_NAME:
+            if any(each.name == name and each.fault(now) is None for each in keys) or name in _TAKEN:
                 message = f"There is a key of the name '{name}' already. Revoke it first, or choose another name."
                 raise ConfigError(message)
             keys.append(made)
@@ -220,6 +231,28 @@ def _given_key(given: str, now: datetime) -> Key:
         )
         raise ConfigError(message)
     return Key(name=GIVEN_NAME, digest=digest(given), scopes=ALL_SCOPES, created_at=now)
+
+
+@contextmanager
+def local_key(port: int) -> Iterator[str | None]:
+    """A key for the block, in a file that only the user who runs this can read: for that user's programs on this
+    machine, who could make keys of their own anyway. None where the file cannot be written.
+    """
+    path, key = local_key_path(port), secrets.token_urlsafe(32)
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as file:
+            file.write(f"{key}\n")
+    except OSError as error:
+        _log.info("programs of the same user need a key", path=str(path), cause=str(error))
+        yield None
+        return
+    try:
+        yield key
+    finally:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
 def first_key(ring: KeyRing, *, fresh: bool) -> str | None:

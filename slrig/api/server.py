@@ -13,7 +13,7 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from types import FrameType
@@ -29,7 +29,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from slrig import KEY_VARIABLE
 from slrig.accept.job import PositionJob
 from slrig.api.app import create_app
-from slrig.api.auth import LINK_PATH, KeyRing, Sessions, first_key
+from slrig.api.auth import LINK_PATH, KeyRing, Sessions, first_key, local_key
 from slrig.api.problems import MEDIA_TYPE, http_problem
 from slrig.api.service import Service
 from slrig.bundle import write_file
@@ -433,11 +433,15 @@ def serve(
         listener.close()
         raise
     address, ended = service.folder.root / ADDRESS_FILE, threading.Event()
+    stack = ExitStack()
     try:
         ring = _keys(settings, given, fresh=new_key) if settings.require_key else None
         app = create_app(service, ring=ring, cookie=f"slrig_session_{port}")
         say(f"slrig serves rig '{rig.name}' at {url}, data in {service.folder.root}. Ctrl-C stops it.")
         if ring is not None:
+            key = stack.enter_context(local_key(port))
+            if key is not None:
+                ring.admit(key)
             _tell_keys(ring, app.state.sessions, url, service.folder, fresh=new_key, say=say)
         if not is_loopback(settings.host):
             say("Other machines can reach it. Keys and scans travel unencrypted: put a TLS proxy in front.")
@@ -462,6 +466,7 @@ def serve(
             raise wrong[0]
     finally:
         ended.set()
+        stack.close()
         service.close()
         with suppress(OSError):
             address.unlink(missing_ok=True)

@@ -12,14 +12,44 @@ from typing import Any, TextIO
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
 from rich.table import Column, Table
 from rich.text import Text
 
 from slrig.printable import printable
 
+_FIRST_SHARE = 0.2
+"""Of the work, before which nothing is said of the time that is left."""
 EVERY_S = 2.0
 """How often a line tells of a stage that goes on, where there is no bar."""
+
+
+def time_left(elapsed_s: float, fraction: float) -> str:
+    """How long work will go on, by what it took so far; "" before a fifth is done, and at the end.
+
+    >>> time_left(10.0, 0.1), time_left(10.0, 0.25), time_left(100.0, 0.4)
+    ('', 'about 30 s left', 'about 2 min 30 s left')
+    """
+    if not _FIRST_SHARE <= fraction < 1.0:
+        return ""
+    minutes, seconds = divmod(round(elapsed_s * (1 / fraction - 1)), 60)
+    return f"about {f'{minutes} min ' if minutes else ''}{seconds} s left"
+
+
+class _TimeLeft(ProgressColumn):
+    """See `time_left`."""
+
+    def render(self, task: Task) -> Text:
+        """Return the words of now."""
+        return Text(time_left(task.elapsed or 0.0, task.completed / (task.total or 1.0)))
 
 
 class ProgressDisplay:
@@ -40,6 +70,7 @@ class ProgressDisplay:
                 BarColumn(bar_width=None),
                 TaskProgressColumn(),
                 TimeElapsedColumn(),
+                _TimeLeft(),
                 TextColumn("{task.fields[detail]:<32}"),
                 console=console,
             )
@@ -102,7 +133,9 @@ class ProgressDisplay:
         self._told_s = time.monotonic()
         stage, fraction, detail = self._now
         line = f"{self._told_s - self._began_s:6.1f} s  {fraction:4.0%}  {stage}"
-        print(f"{line:<40}{detail}".rstrip(), file=self._stream, flush=True)
+        left = time_left(self._told_s - self._began_s, fraction)
+        words = ", ".join(each for each in (detail, left) if each)
+        print(f"{line:<40}{words}".rstrip(), file=self._stream, flush=True)
 
 
 @contextmanager

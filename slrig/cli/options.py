@@ -59,7 +59,10 @@ class ServiceOptions:
 
     url: Annotated[str, typer.Option(envvar="SLRIG_URL", help="Where the service is.")] = "http://127.0.0.1:8731"
     key_file: Annotated[
-        Path | None, typer.Option(help="File that holds the service's API key. Default: the variable SLRIG_API_KEY.")
+        Path | None,
+        typer.Option(
+            help="File that holds the service's API key. Default: SLRIG_API_KEY; your own service here needs none."
+        ),
     ] = None
 
     def client(self) -> Client:
@@ -148,6 +151,10 @@ class MeshOptions:
     drop_finest_bits: Annotated[
         int | None,
         typer.Option(help="Finest Gray bits not to read where code edges give the points. Default: as resolved."),
+    ] = None
+    mesh_axes: Annotated[
+        str | None,
+        typer.Option(help="Axes of PLY, STL, OBJ, 3MF: upright, for viewers (default), or rig, the calibration's."),
     ] = None
 
     def asked(self) -> dict[str, Any]:

@@ -20,11 +20,10 @@ from typing import Any
 import typer
 from rich.table import Column
 
-from slrig import KEY_VARIABLE
+from slrig import KEY_VARIABLE, data_home
 from slrig.cli.display import ProgressDisplay, counted, print_table, progress_shown, quality_lines
 from slrig.cli.options import ServiceOptions
 from slrig.client import Client, ScanJob
-from slrig.config import default_data_dir
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
 from slrig.examples import example_names, is_example
@@ -222,7 +221,7 @@ def run_demo(rig: Path, output: Path, data: Path | None, *, show: bool) -> None:
 
     Raises ConfigError where there is no such rig file, ServiceError where no service starts or the scan fails.
     """
-    data = default_data_dir() / "demo" if data is None else data
+    data = data_home() / "demo" if data is None else data
     with ExitStack() as stack:
         with progress_shown() as display:
             client = stack.enter_context(rig_service(rig, data, display, no_key=show))
@@ -412,9 +411,9 @@ Next:
   1. Your own rig: copy a rig file, change it, and run it.
        {copy}
        {program} demo {own_text}
-  2. A live service: start it, and scan with it from another terminal, with the key that it prints.
+  2. A live service: start it, and scan with it from another terminal.
        {program} serve {rig_text}
-       {KEY_VARIABLE}=KEY {program} scan --output {live}
+       {program} scan --output {live}
   3. A recorded bundle: reconstruct this scan, or one of yours, again.
        {program} reconstruct {bundle_text} --output {again}"""
     )

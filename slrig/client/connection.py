@@ -8,7 +8,7 @@ import os
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -16,7 +16,7 @@ from urllib.parse import quote, urlsplit
 
 import httpx2
 
-from slrig import KEY_VARIABLE
+from slrig import KEY_VARIABLE, local_key_path
 from slrig.client.errors import UnreachableError, foreign, refusal
 from slrig.disk import staging_name, storage_errors
 from slrig.errors import ConfigError
@@ -116,7 +116,8 @@ Json: TypeAlias = dict[str, Any]
 class Connection:
     """The connections to one service.
 
-    url, key : None: as SLRIG_URL and SLRIG_API_KEY say; without the first, the service of this machine. pause : waits
+    url, key : None: as SLRIG_URL and SLRIG_API_KEY say; without the first, the service of this machine; without the
+    second, what a service of the same user on this machine left for its programs. pause : waits
     between two tries. transport : httpx2's, in place of the network.
 
     Raises
@@ -330,9 +331,18 @@ def _parts(pieces: Iterator[bytes]) -> Iterator[bytes]:
             waiting = waiting[start + length :]
 
 
+def _local_key(url: str) -> str | None:
+    """The key of a service of the same user on this machine; None for another service."""
+    with suppress(OSError, ValueError):
+        parts = urlsplit(url)
+        if parts.hostname in _LOCAL:
+            return local_key_path(parts.port or 80).read_text("ascii").strip() or None
+    return None
+
+
 def _http(url: str | None, key: str | None, transport: httpx2.BaseTransport | None) -> httpx2.Client:
     url = url or os.environ.get("SLRIG_URL") or URL
-    key = key if key is not None else os.environ.get(KEY_VARIABLE) or None
+    key = key if key is not None else os.environ.get(KEY_VARIABLE) or _local_key(url)
     if key is not None and not (key.isascii() and key.isprintable()):
         message = (
             f"The API key holds a character that no key has. Copy it again as the service printed it, into "

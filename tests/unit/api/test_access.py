@@ -19,6 +19,7 @@ from sse_starlette import EventSourceResponse
 from starlette.types import Receive, Send
 from starlette.types import Scope as ASGIScope
 
+from slrig import KEY_VARIABLE, local_key_path
 from slrig.api import auth as access
 from slrig.api.app import bare_app, create_app
 from slrig.api.auth import (
@@ -33,10 +34,12 @@ from slrig.api.auth import (
     Refused,
     Sessions,
     first_key,
+    local_key,
 )
 from slrig.api.problems import _CODES, explanations, text
 from slrig.api.scopes import READING, KeyScope, needed_scope
 from slrig.api.server import _keys, take_secrets
+from slrig.client.connection import Connection
 from slrig.config import ServiceSettings
 from slrig.errors import ConfigError, StorageError
 from slrig.failure import errors_by_code
@@ -534,6 +537,37 @@ def test_picture_that_moves_light_says_which_page_it_is_on(client: TestClient, s
     for headers, status in (({}, 403), ({"Referer": f"{HERE}:3000/"}, 403), ({"Referer": f"{HERE}/docs"}, 404)):
         assert browser.get(path, headers=headers).status_code == status
     assert client.get(path).status_code == 404
+
+
+def test_programs_of_the_same_user_here_need_no_key_as_long_as_the_service_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    monkeypatch.delenv(KEY_VARIABLE, raising=False)
+    ring = KeyRing(tmp_path / "keys.json")
+
+    def sent(url: str) -> str | None:
+        with Connection(url).http as mine:
+            return mine.headers.get("authorization")
+
+    with local_key(8731) as key:
+        assert key is not None
+        ring.admit(key)
+        found = ring.find(key)
+        assert found is not None
+        assert (found.name, set(found.scopes)) == ("local", set(KeyScope))
+        assert ring.everybody == ()
+        path = local_key_path(8731)
+        assert (path.stat().st_mode & 0o777, path.parent.stat().st_mode & 0o777) == (0o600, 0o700)
+        assert sent("http://127.0.0.1:8731") == sent("http://localhost:8731") == f"Bearer {key}"
+        # Neither another service nor another machine is told.
+        assert sent("http://127.0.0.1:8732") is sent("http://192.0.2.1:8731") is None
+        with pytest.raises(ConfigError, match="of the name 'local' already"):
+            ring.add("local", [])
+    assert sent("http://127.0.0.1:8731") is None
+    monkeypatch.setenv("XDG_STATE_HOME", "/proc")
+    with local_key(8731) as key:
+        assert key is None
 
 
 def test_own_pages_and_programs_are_served(client: TestClient, served: ServedBench) -> None:
