@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from slrig.model import FloatArray, IntArray
 from slrig.reconstruction.identification import NumberedStripes
@@ -63,8 +63,9 @@ def bit_agreement(numbered: NumberedStripes, bits: int, cell_px: float, /) -> Bi
         ):
             weight = 1 / (variance * max(1.0, _CORRELATED_POINTS / step))
             sums[(each - first, *here)], weights[(each - first, *here)] = weight * px, weight
-    around = (1, _NEIGHBOURS, _NEIGHBOURS)
-    sums, weights = (_NEIGHBOURS**2 * uniform_filter(each, around, mode="constant") for each in (sums, weights))
+    for each in (*sums, *weights):
+        side = (_NEIGHBOURS, _NEIGHBOURS)
+        each[:] = cv2.boxFilter(each, -1, side, normalize=False, borderType=cv2.BORDER_CONSTANT)
     known = weights > 0
     spread = 1 / np.where(known, weights, np.inf)
     square = (sums * spread) ** 2

@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from slrig.model import Axis, FloatArray, Gray, LineShift, Pinhole, Size, from_gray, to_gray
 from slrig.reconstruction.identification import StripeEnsemble
 from slrig.reconstruction.phase import has_phase
-from slrig.reconstruction.second_axis import AxisPositions, SecondAxis, find_crossings, sample_image
+from slrig.reconstruction.second_axis import AxisPositions, SecondAxis, find_crossings
+from slrig.reconstruction.stripes import sample_image
 from slrig.reconstruction.triangulation import pixel_rays, project
 
 _MAX_POINTS = 20_000  # of a check; their mean is known to a hundredth of their scatter

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
 
 from slrig.kernels import in_bands
 from slrig.model import FloatArray, IntArray, NoiseModel, Refusal, coarse_bit_count
@@ -253,7 +252,9 @@ def _block_skew(points_px: FloatArray, skew_px: FloatArray, shape: tuple[int, ..
 
     def around(values: FloatArray | None) -> FloatArray:
         total = np.bincount(block, values, rows * columns).reshape(rows, columns).astype(np.float64)
-        return np.asarray(uniform_filter(total, _BLOCKS_AROUND, mode="constant") * _BLOCKS_AROUND**2)
+        return np.asarray(
+            cv2.boxFilter(total, -1, (_BLOCKS_AROUND, _BLOCKS_AROUND), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        )
 
     count = np.maximum(around(None), 1e-9)
     skewed = np.zeros((rows, columns, 2))

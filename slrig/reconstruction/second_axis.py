@@ -11,11 +11,10 @@ it exactly where stripes cross code edges, for `slrig.reconstruction.calibration
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from slrig.model import FloatArray, NoiseModel, Pinhole
 from slrig.reconstruction.decoded_image import CodeTables
@@ -23,6 +22,7 @@ from slrig.reconstruction.decoding import DecodingLimits, decode, decode_edges
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.phase import has_phase, position_map
 from slrig.reconstruction.sinusoids import decode_sinusoids
+from slrig.reconstruction.stripes import sample_image
 from slrig.reconstruction.triangulation import SheetCurves, project
 
 _UNIFORM = 12**-0.5  # standard deviation of a uniform distribution of width 1
@@ -31,11 +31,6 @@ _MIN_LIMIT_PX = 1.0  # smaller differences are errors of the calibration, not li
 _MAX_SIGMA = 6.0  # beyond this many standard deviations light comes from elsewhere
 _MAX_UNREAD = 1  # bits: blur that hides more displaces the edges of the others
 _MAX_SPACING_PX = 2.0  # of neighbouring points of a stripe
-
-
-def sample_image(image: NDArray[Any], points_px: FloatArray) -> FloatArray:
-    """(n,) float64: an image at (x, y) points, interpolated between the four pixels around each."""
-    return np.asarray(map_coordinates(image, points_px.T[::-1], output=np.float64, order=1, mode="nearest"))
 
 
 @dataclass(frozen=True, slots=True)

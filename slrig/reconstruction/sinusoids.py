@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammainc, gammaincinv
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, Gray, IntArray, NoiseModel, Refusal, Sine, sine_groups
@@ -380,6 +379,9 @@ def _misfit(squared: FloatArray, per_share: FloatArray, freedom: int) -> tuple[f
 
     Compared is the mean of the lesser nine tenths of χ², since the median of sums of whole numbers is coarse.
     """
+    # A quarter of a second to load, and only sinusoids need it.
+    from scipy.special import gammainc, gammaincinv
+
     usable = np.isfinite(squared) & np.isfinite(per_share)
     squared, per_share = squared[usable], per_share[usable]
     limit = float(gammaincinv(freedom / 2, _COUNTED))

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, IntArray
@@ -820,6 +819,20 @@ def smoothing_shift_px(
     return shift_px
 
 
+def sample_image(image: NDArray[Any], points_px: FloatArray) -> FloatArray:
+    """(n,) float64: an image at (x, y) points, interpolated between the four pixels around each; beyond the outermost
+    pixels it goes on as they are.
+    """
+    last = np.array(image.shape[1::-1]) - 1
+    within = np.clip(points_px, 0, last)
+    first = np.minimum(np.floor(within), np.maximum(last - 1, 0)).astype(np.intp)
+    (x, y), (right, down) = (within - first).T, np.minimum(first + 1, last).T
+    left, up = first.T
+    above = (1 - x) * image[up, left] + x * image[up, right]
+    below = (1 - x) * image[down, left] + x * image[down, right]
+    return np.asarray((1 - y) * above + y * below, dtype=np.float64)
+
+
 def edge_skew_px(image: NDArray[np.float32], points: LinePoints, filter_px: float, /) -> FloatArray:
     """(n,) float64: how far the zero crossings of an image from -1 to 1 lie from the centroids of their edges, px,
     along the normal; of edges that are far from others.
@@ -832,7 +845,7 @@ def edge_skew_px(image: NDArray[np.float32], points: LinePoints, filter_px: floa
     slope = np.where(np.abs(slope) < 1e-3, np.nan, slope)
     # By itself is an edge with light and dark on its sides: 3 of its deviations, by its slope, away.
     away = points.normals * (3 * np.sqrt(2 / np.pi) / slope)[:, None]
-    sides = [map_coordinates(image, (points.points_px + each)[:, ::-1].T, order=1) for each in (away, -away)]
+    sides = [sample_image(image, np.nan_to_num(points.points_px + each)) for each in (away, -away)]
     alone = (sides[0] > _MIN_SIDE) & (sides[1] < -_MIN_SIDE)
     return np.asarray(np.where(alone, bend / (np.pi * slope * slope * slope), np.nan))
 
@@ -844,10 +857,10 @@ def _slope_and_bend(
     if not chosen.any():
         return np.zeros(0), np.zeros(0)
     zero, one, two = gaussian_kernels(filter_px)
-    at = points.points_px[chosen, ::-1].T
+    at = points.points_px[chosen]
     pairs = ((one, zero), (zero, one), (two, zero), (one, one), (zero, two))
     derivatives = (cv2.sepFilter2D(image, cv2.CV_32F, across, down) for across, down in pairs)
-    rx, ry, rxx, rxy, ryy = (map_coordinates(each, at, order=1) for each in derivatives)
+    rx, ry, rxx, rxy, ryy = (sample_image(each, at) for each in derivatives)
     nx, ny = points.normals[chosen].T
     return nx * rx + ny * ry, nx * nx * rxx + 2 * nx * ny * rxy + ny * ny * ryy
 

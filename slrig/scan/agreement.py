@@ -11,9 +11,9 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label
 
 from slrig.errors import CalibrationError
 from slrig.model import DEVICE_PARAMETERS, Axis, Calibration, FloatArray, Pinhole, Refusal, SolveRecord
@@ -600,10 +600,10 @@ def drop_contradicting_areas(
         lowest = np.min([each.min(axis=0) for each in cells], axis=0)
         grid = np.zeros(np.max([each.max(axis=0) for each in cells], axis=0) - lowest + 1, dtype=np.bool_)
         grid[tuple((cell_numbers(found.residuals.sheet_px[far], size_px) - lowest).T)] = True
-        areas, count = label(grid, np.ones((3, 3)))
+        count, areas = cv2.connectedComponents(grid.astype(np.uint8), connectivity=8)
         area_of_point = [areas[tuple((each - lowest).T)] for each in cells]
         dropped = 0
-        for area in range(1, count + 1):
+        for area in range(1, count):
             inside = [each == area for each in area_of_point]
             worse = int(np.argmin([_worth(parts[k].deviation_mm[each]) for k, each in zip(pair, inside, strict=True)]))
             used[pair[worse]] &= ~inside[worse]

@@ -107,9 +107,11 @@ def test_help_and_version_load_nothing_heavy() -> None:
     assert printed(code) == "[]"
 
 
-def test_the_reconstruction_loads_no_database() -> None:
-    heavy = {"sqlalchemy", "alembic", "fastapi"}
-    code = f"import sys, slrig.jobs.worker, slrig.scan.reconstruct\nprint(sorted({heavy} & set(sys.modules)))"
+def test_the_reconstruction_loads_neither_a_database_nor_what_few_scans_need() -> None:
+    heavy = {"sqlalchemy", "alembic", "fastapi", "httpx2", "trimesh", "reportlab"}
+    heavy |= {f"scipy.{each}" for each in ("ndimage", "optimize", "sparse", "spatial", "special")}
+    modules = "slrig.jobs.worker, slrig.cli.reconstruct, slrig.scan.reconstruct"
+    code = f"import sys, {modules}\nprint(sorted({heavy} & set(sys.modules)))"
     assert printed(code) == "[]"
 
 
@@ -479,7 +481,9 @@ def test_progress_off_a_terminal_is_one_line_per_stage() -> None:
         display(stage, fraction, "")
     display.stop()
     lines = stream_of_text.getvalue().splitlines()
-    assert [line.split("  ")[-1] for line in lines] == ["capture", "decode", "done"]
+    stages = [re.sub(" +about .*", "", line).split("  ")[-1] for line in lines]
+    assert stages == ["capture", "decode", "done"]
+    assert ["left" in line for line in lines] == [False, True, False]
     assert [line.split("%")[0].split()[-1] for line in lines] == ["0", "50", "100"]
 
 

@@ -10,7 +10,8 @@ from slrig.model import Axis, FloatArray, Gray, NoiseModel, Pinhole, Size, Sourc
 from slrig.patterns import cell_positions, edge_positions, index_of_word
 from slrig.reconstruction import AxisPositions, CodeTables, DecodingLimits, SheetCurves, axis_residuals
 from slrig.reconstruction.frames import AxisFrames
-from slrig.reconstruction.second_axis import SecondAxis, decode_second_axis, sample_image
+from slrig.reconstruction.second_axis import SecondAxis, decode_second_axis
+from slrig.reconstruction.stripes import sample_image
 
 PROJECTOR = Size(64, 48)
 IMAGE = (90, 60)
