@@ -35,7 +35,7 @@ from slrig.bundle import (
 )
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobRecord, JobState
-from slrig.model import Axis, FlipRule, SequenceName, Size
+from slrig.model import Axis, FlipRule, MeshAxes, SequenceName, Size
 from slrig.scan.plan import MOST_TURN_DEG, PatternPlan, PresetUse, ReconstructionPlan, ScanPlan, unused_options
 
 MOST_EXPOSURE_S = 60.0
@@ -128,6 +128,11 @@ class ReconstructionRequest(Strict):
         default=None,
         description="number of finest bits of the code not to read where its edges give the points: without line-shift "
         "frames, or where the camera does not resolve lines. Default 0: every bit that the camera resolves",
+    )
+    mesh_axes: Annotated[MeshAxes, Field(strict=False)] | None = Field(
+        default=None,
+        description="axes of mesh.ply, points.ply, STL, OBJ and 3MF: x right, y up, z towards the rig, or those of the "
+        "calibration (x right, y down, z away), in which all other files and figures are. Default upright",
     )
 
 

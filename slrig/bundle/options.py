@@ -26,6 +26,7 @@ from slrig.model import (
     FlipRule,
     FloatArray,
     MeasuredAxis,
+    MeshAxes,
     PlaneKind,
     Region,
     SequenceName,
@@ -418,6 +419,7 @@ class ScanDefaults(Strict):
     axis: Annotated[Axis, Field(strict=False)] | None = None
     region: RegionTable | None = None
     drop_finest_bits: Annotated[int, Field(ge=0)] | None = None
+    mesh_axes: Annotated[MeshAxes, Field(strict=False)] | None = None
     exposure_s: ExposureSeconds | None = None
     exposures_s: BracketSeconds | None = Field(
         default=None,

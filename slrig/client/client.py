@@ -191,7 +191,7 @@ class ScanResult:
 
     @property
     def mesh(self) -> trimesh.Trimesh:
-        """The mesh in mm, with `vertex_attributes` such as sigma_mm."""
+        """The mesh in mm, in the axes of the calibration as `points_mm`, with `vertex_attributes` such as sigma_mm."""
         return self._read("mesh.ply", _read_mesh)
 
     @property
@@ -304,6 +304,7 @@ def _cloud_file(camera: str) -> str:
 
 
 def _read_mesh(ply: bytes) -> trimesh.Trimesh:
+    import numpy as np
     import trimesh
 
     mesh = trimesh.load_mesh(io.BytesIO(ply), file_type="ply", process=False)
@@ -311,14 +312,17 @@ def _read_mesh(ply: bytes) -> trimesh.Trimesh:
     for name in ("sigma_mm", "stripe", "albedo_mark"):
         mesh.vertex_attributes[name] = stored[name].reshape(-1)
     mesh.units = "mm"
+    if b"\ncomment axes x right, y up," in ply[: ply.find(b"\nend_header")]:
+        mesh.apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))
     return mesh
 
 
 class Client:
     """A running service: scans as objects, and each of its requests as a method. A context manager.
 
-    url, key : None: as SLRIG_URL and SLRIG_API_KEY say; without the first, the service of this machine. pause : waits
-    between two tries. transport : httpx2's, in place of the network.
+    url, key : None: as SLRIG_URL and SLRIG_API_KEY say; without the first, the service of this machine; without the
+    second, what a service of the same user on this machine left for its programs. pause : waits between two tries.
+    transport : httpx2's, in place of the network.
 
     Raises
     ------

@@ -19,6 +19,17 @@ _LINEAR_UP_TO, _LINEAR_SLOPE = 0.0031308, 12.92
 _POWER, _OFFSET = 2.4, 0.055
 
 
+class MeshAxes(StrEnum):
+    """Axes of the files that hold a mesh or its points, mm.
+
+    UPRIGHT : x right, y up, z towards the rig, as viewers and CAD programs have them: (x, -y, -z) of the calibration.
+    RIG : those of the calibration, x right, y down, z away from the rig; for robots, and to compare with other data.
+    """
+
+    UPRIGHT = "upright"
+    RIG = "rig"
+
+
 def linear_to_srgb(light: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
     """Return the sRGB value, (...) uint8, of light relative to white, clipped to 0 to 1; NaN gives 0."""
     clipped = np.clip(np.nan_to_num(light, nan=0.0, posinf=1.0), 0, 1)

@@ -12,7 +12,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict, is_dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from slrig.bundle import stored_json, sync_folder, sync_tree, write_file
 from slrig.disk import staging_name, storage_errors
 from slrig.errors import InvalidInputError
 from slrig.jobs.records import STAGES_S
-from slrig.model import FloatArray, IntArray, Mesh, PointCurves
+from slrig.model import FloatArray, IntArray, Mesh, MeshAxes, PointCurves
 from slrig.scan.formats import encode_coarse_glb, encode_mesh_3mf, encode_mesh_obj, encode_mesh_stl, encode_view_glb
 
 MESH = "mesh.ply"
@@ -39,6 +39,15 @@ ON_REQUEST: Mapping[str, Callable[[Mesh], bytes]] = {
 }
 """Files that are made of mesh.ply, and only when somebody wants them."""
 
+_TURNS = {
+    MeshAxes.UPRIGHT: np.array([1, -1, -1], dtype=np.float32),
+    MeshAxes.RIG: np.ones(3, dtype=np.float32),
+}
+"""Factors by which coordinates of the calibration's axes become those of a file, and back."""
+_AXES_WORDS = {
+    MeshAxes.UPRIGHT: "comment axes x right, y up, z towards the rig: those of the calibration are (x, -y, -z)",
+    MeshAxes.RIG: "comment axes those of the calibration",
+}
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 _END_OF_HEADER = b"\nend_header\n"
 _CALIBRATION_PART = "sigma_calibration_mm"
@@ -73,8 +82,12 @@ def write_converted(folder: Path, name: str) -> None:
 
 
 def converted(ply: bytes, name: str) -> bytes:
-    """One of `ON_REQUEST`, made of a mesh.ply. Raises InvalidInputError: that is not as slrig wrote it."""
-    return ON_REQUEST[name](decode_mesh_ply(ply))
+    """One of `ON_REQUEST`, made of a mesh.ply, in its axes; GLB in its own. Raises InvalidInputError: mesh.ply is not
+    as slrig wrote it.
+    """
+    mesh = decode_mesh_ply(ply)
+    turn = _TURNS[MeshAxes.RIG if name.endswith(".glb") else _axes_of(ply)]
+    return ON_REQUEST[name](replace(mesh, vertices_mm=mesh.vertices_mm * turn, normals=mesh.normals * turn))
 
 
 def write_report(report: Mapping[str, object], path: Path) -> None:
@@ -95,7 +108,11 @@ def encode_report(report: Mapping[str, object]) -> bytes:
 
 
 def encode_mesh_ply(
-    mesh: Mesh, *, sigma_calibration_mm: FloatArray | None = None, views: IntArray | None = None
+    mesh: Mesh,
+    *,
+    sigma_calibration_mm: FloatArray | None = None,
+    views: IntArray | None = None,
+    axes: MeshAxes = MeshAxes.UPRIGHT,
 ) -> bytearray:
     """Binary little-endian PLY in mm: position, normal, colour, `albedo_mark`, `sigma_mm`, `stripe` per vertex;
     triangles.
@@ -103,10 +120,11 @@ def encode_mesh_ply(
     Colours are sRGB; `albedo_mark` is a number of `slrig.model.AlbedoMark`.
     sigma_calibration_mm : (V,), the part of `sigma_mm` that the calibration's own error makes, one property more; None
     where the calibration does not state it. views : (V,), of how many views each vertex is the mean, one property more.
+    axes : of the file; `mesh` is in those of the calibration.
     """
-    properties = {**_vertex_properties(mesh), **_further(sigma_calibration_mm, views)}
+    properties = {**_vertex_properties(mesh, _TURNS[axes]), **_further(sigma_calibration_mm, views)}
     kind = _record(properties)
-    header = _ply_header(_mesh_elements(kind, len(mesh.vertices_mm), len(mesh.faces)))
+    header = _ply_header(_mesh_elements(kind, len(mesh.vertices_mm), len(mesh.faces)), axes)
     data, (vertices, faces) = _room(header, (kind, len(mesh.vertices_mm)), (_FACE, len(mesh.faces)))
     _fill(vertices, properties)
     faces["count"] = 3
@@ -115,7 +133,8 @@ def encode_mesh_ply(
 
 
 def decode_mesh_ply(data: bytes | bytearray) -> Mesh:
-    """The mesh in a PLY that `encode_mesh_ply` made, without what that writes of its vertices besides.
+    """The mesh in a PLY that `encode_mesh_ply` made, in the axes of the calibration, without what that writes of its
+    vertices besides.
 
     Raises
     ------
@@ -125,11 +144,16 @@ def decode_mesh_ply(data: bytes | bytearray) -> Mesh:
     head, mark, body = data.partition(_END_OF_HEADER)
     counts = [int(count) for count in re.findall(rb"^element \w+ (\d{1,12})$", head, re.MULTILINE)]
     stated, views = (_NONE if f" {name}\n".encode() in head else None for name in (_CALIBRATION_PART, _VIEWS))
-    kind = _record({**_vertex_properties(_NO_MESH), **_further(stated, views)})
+    axes = _axes_of(data)
+    kind = _record({**_vertex_properties(_NO_MESH, _TURNS[axes]), **_further(stated, views)})
     vertex_count, face_count = counts if len(counts) == 2 else (0, 0)
     vertex_bytes = vertex_count * kind.itemsize
     length = vertex_bytes + face_count * _FACE.itemsize
-    wanted = _ply_header(_mesh_elements(kind, vertex_count, face_count))
+    elements = _mesh_elements(kind, vertex_count, face_count)
+    wanted = _ply_header(elements, axes)
+    earlier = _ply_header(elements, None)
+    if head + mark == earlier:
+        wanted = earlier
     if head + mark != wanted or len(body) != length:
         message = (
             f"mesh.ply: expected the header that slrig writes and {length} bytes after it, found "
@@ -142,9 +166,9 @@ def decode_mesh_ply(data: bytes | bytearray) -> Mesh:
         message = "mesh.ply: a triangle names a vertex that is not there; reconstruct the bundle again"
         raise InvalidInputError(message)
     return Mesh(
-        vertices_mm=np.stack([vertices[name] for name in ("x", "y", "z")], axis=1),
+        vertices_mm=np.stack([vertices[name] for name in ("x", "y", "z")], axis=1) * _TURNS[axes],
         faces=np.ascontiguousarray(faces),
-        normals=np.stack([vertices[name] for name in ("nx", "ny", "nz")], axis=1),
+        normals=np.stack([vertices[name] for name in ("nx", "ny", "nz")], axis=1) * _TURNS[axes],
         colour=np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1),
         mark=np.ascontiguousarray(vertices[_MARK]),
         sigma_mm=np.ascontiguousarray(vertices["sigma_mm"]),
@@ -152,10 +176,17 @@ def decode_mesh_ply(data: bytes | bytearray) -> Mesh:
     )
 
 
-def _vertex_properties(mesh: Mesh) -> dict[str, tuple[str, NDArray[Any]]]:
+def _axes_of(ply: bytes | bytearray) -> MeshAxes:
+    """Axes that the header of a PLY states; those of the calibration in files of earlier versions."""
+    head, _, _ = ply.partition(_END_OF_HEADER)
+    stated = f"\n{_AXES_WORDS[MeshAxes.UPRIGHT]}\n".encode() in head
+    return MeshAxes.UPRIGHT if stated else MeshAxes.RIG
+
+
+def _vertex_properties(mesh: Mesh, turn: NDArray[np.float32]) -> dict[str, tuple[str, NDArray[Any]]]:
     return {
-        **_columns(("x", "y", "z"), "f4", mesh.vertices_mm),
-        **_columns(("nx", "ny", "nz"), "f4", mesh.normals),
+        **_columns(("x", "y", "z"), "f4", mesh.vertices_mm * turn),
+        **_columns(("nx", "ny", "nz"), "f4", mesh.normals * turn),
         **_columns(("red", "green", "blue"), "u1", mesh.colour),
         _MARK: ("u1", mesh.mark),
         "sigma_mm": ("f4", mesh.sigma_mm),
@@ -181,19 +212,23 @@ def _mesh_elements(vertex: np.dtype[np.void], vertex_count: int, face_count: int
 
 
 def encode_points_ply(
-    curves: PointCurves, normals: NDArray[np.float32], *, sigma_calibration_mm: FloatArray | None = None
+    curves: PointCurves,
+    normals: NDArray[np.float32],
+    *,
+    sigma_calibration_mm: FloatArray | None = None,
+    axes: MeshAxes = MeshAxes.UPRIGHT,
 ) -> bytearray:
     """Binary little-endian PLY in mm: position, normal, colour, `albedo_mark`, `sigma_mm`, `stripe`, `source`,
     `bridge_after` per point.
 
     normals : (n, 3), unit, of the mesh; NaN for a point that is not in it. `stripe` is the projector column rounded
     down, as in the mesh; `bridge_after` is 1 where the step to the next point of its curve joins two stripes.
-    sigma_calibration_mm : (n,), as for `encode_mesh_ply`.
+    sigma_calibration_mm : (n,), and axes : as for `encode_mesh_ply`.
     """
     columns = np.floor(curves.column_px).astype(np.int32)
     properties = {
-        **_columns(("x", "y", "z"), "f4", curves.points_mm),
-        **_columns(("nx", "ny", "nz"), "f4", normals),
+        **_columns(("x", "y", "z"), "f4", curves.points_mm * _TURNS[axes]),
+        **_columns(("nx", "ny", "nz"), "f4", normals * _TURNS[axes]),
         **_columns(("red", "green", "blue"), "u1", curves.colour),
         _MARK: ("u1", curves.mark),
         "sigma_mm": ("f4", curves.sigma_mm),
@@ -203,7 +238,7 @@ def encode_points_ply(
         **_further(sigma_calibration_mm),
     }
     kind, count = _record(properties), len(curves.points_mm)
-    data, (points,) = _room(_ply_header(_vertex_element(kind, count)), (kind, count))
+    data, (points,) = _room(_ply_header(_vertex_element(kind, count), axes), (kind, count))
     _fill(points, properties)
     return data
 
@@ -242,9 +277,11 @@ def _vertex_element(vertex: np.dtype[np.void], count: int) -> list[str]:
     return [f"element vertex {count}", *properties]
 
 
-def _ply_header(elements: list[str]) -> bytes:
+def _ply_header(elements: list[str], axes: MeshAxes | None) -> bytes:
+    """Axes : None for a file of an earlier version, which does not state them."""
     comments = ["comment unit mm", "comment sigma_mm standard deviation along the surface normal"]
-    lines = ["ply", "format binary_little_endian 1.0", *comments, *elements]
+    stated = [] if axes is None else [_AXES_WORDS[axes]]
+    lines = ["ply", "format binary_little_endian 1.0", *comments, *stated, *elements]
     return "\n".join(lines).encode("ascii") + _END_OF_HEADER
 
 

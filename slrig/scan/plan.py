@@ -33,6 +33,7 @@ from slrig.model import (
     Black,
     Calibration,
     FlipRule,
+    MeshAxes,
     Pattern,
     PatternSequence,
     Pinhole,
@@ -147,12 +148,14 @@ class ReconstructionPlan:
     region : what of the scene is measured; None for all that the devices see.
     drop_finest_bits : number of finest bits of the code not to read where its edges give the points, beside those that
     the camera does not resolve.
+    mesh_axes : of mesh.ply, points.ply, STL, OBJ and 3MF, `MeshAxes` or its value. All other files and figures are in
+    the axes of the calibration; GLB has axes of its own.
 
     Raises
     ------
     ConfigError
         depth_edge_ratio is not above 1 and finite, max_code_gap is below 1, flip_rule is none of `FlipRule`, axis none
-        of `Axis`, or drop_finest_bits below 0.
+        of `Axis`, mesh_axes none of `MeshAxes`, or drop_finest_bits below 0.
     """
 
     keep_holes: bool = False
@@ -163,6 +166,7 @@ class ReconstructionPlan:
     axis: Axis | None = None
     region: Region | None = None
     drop_finest_bits: int = 0
+    mesh_axes: MeshAxes = MeshAxes.UPRIGHT
 
     def __post_init__(self) -> None:
         if not 1 < self.depth_edge_ratio < math.inf:
@@ -187,6 +191,11 @@ class ReconstructionPlan:
             object.__setattr__(self, "flip_rule", FlipRule(self.flip_rule))
         except ValueError as cause:
             message = f"flip_rule: expected {' or '.join(FlipRule)}, found {self.flip_rule!r}; constrained is usual"
+            raise ConfigError(message) from cause
+        try:
+            object.__setattr__(self, "mesh_axes", MeshAxes(self.mesh_axes))
+        except ValueError as cause:
+            message = f"mesh_axes: expected {' or '.join(MeshAxes)}, found {self.mesh_axes!r}; upright is usual"
             raise ConfigError(message) from cause
         try:
             object.__setattr__(self, "axis", None if self.axis is None else Axis(self.axis))

@@ -291,13 +291,15 @@ def reconstruct_into(
         require_coverage(bundle, cameras, covered)
         entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")
         # One at a time: each is as large as the mesh.
-        place(MESH, encode_mesh_ply(mesh, sigma_calibration_mm=meshed.mesh_calibration_sigma_mm))
+        place(MESH, encode_mesh_ply(mesh, sigma_calibration_mm=meshed.mesh_calibration_sigma_mm, axes=plan.mesh_axes))
         # The mesh is what somebody waits for; what is left is shared by two threads.
         pictures = beside.submit(_encoded_pictures, mesh, cameras)
         place("mesh.glb", encode_mesh_glb(mesh))
         place(
             "points.ply",
-            encode_points_ply(meshed.curves, meshed.normals, sigma_calibration_mm=meshed.calibration_sigma_mm),
+            encode_points_ply(
+                meshed.curves, meshed.normals, sigma_calibration_mm=meshed.calibration_sigma_mm, axes=plan.mesh_axes
+            ),
         )
         sizes = mesh_figures(mesh.vertices_mm, mesh.faces)
         figures = {**meshed.figures, "figures": sizes}

@@ -376,6 +376,8 @@ def scanned_here(rig: Rig, folder: Path) -> Mesh:
 def mesh_in(results: Path) -> Mesh:
     """The mesh that a scan wrote, as far as its shape goes."""
     read = trimesh.load_mesh(results / "mesh.ply", process=False)
+    # From y up, z towards the rig, to the axes of the calibration.
+    read.apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))
     count = len(read.vertices)
     return Mesh(
         np.asarray(read.vertices, np.float32),

@@ -138,8 +138,11 @@ def test_the_skull_covers_its_reference_points(shared: Path, tmp_path: Path) -> 
     report = reconstructed(folder, tmp_path / "out")
     assert report["method"] == "Gray-only"
     reference: FloatArray = np.load(folder / "reference_points_mm.npy").astype(np.float64)
-    points = np.asarray(trimesh.load(tmp_path / "out" / "points.ply", process=False).vertices)
-    vertices = np.asarray(trimesh.load(tmp_path / "out" / "mesh.ply", process=False).vertices)
+    # From y up, z towards the rig, to the axes of the calibration.
+    points, vertices = (
+        np.asarray(trimesh.load(tmp_path / "out" / name, process=False).vertices) * [1, -1, -1]
+        for name in ("points.ply", "mesh.ply")
+    )
     to_points = _distances(reference, points)
     to_vertices = _distances(reference, vertices)
     assert (to_points < 1.0).mean() >= 0.95

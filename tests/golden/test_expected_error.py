@@ -142,9 +142,10 @@ def observed(folder: Path, seed: int) -> Observations:
 
 
 def vertices(mesh: Path) -> dict[str, NDArray[Any]]:
-    """Every property of a mesh's vertices, by name."""
+    """Every property of a mesh's vertices, by name; x, y and z in the axes of the calibration."""
     data = trimesh.load(mesh, process=False).metadata["_ply_raw"]["vertex"]["data"]
-    return {name: data[name].ravel().astype(np.float64) for name in data.dtype.names}
+    found = {name: data[name].ravel().astype(np.float64) for name in data.dtype.names}
+    return found | {name: -found[name] for name in ("y", "z", "ny", "nz")}
 
 
 def on_surface(points: FloatArray, kind: str, place: int, camera: Pinhole, reach_mm: float) -> Found:

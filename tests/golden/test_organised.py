@@ -97,6 +97,8 @@ def test_points_lie_on_the_mesh_and_on_the_rays_of_their_pixels(scan: Clouds, ca
     cloud, device = scan.cloud(camera), scan.cameras[camera]
     assert np.abs(device.distortion).max() > 0
     mesh = trimesh.load(scan.folder / "mesh.ply", process=False)
+    # From y up, z towards the rig, to the axes of the calibration.
+    mesh.apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))
     assert distances_mm(mesh, sampled(cloud)).max() < 1e-3
     rows, columns = np.nonzero(cloud["cause"] == 0)
     points = cloud["points_mm"][rows, columns].astype(np.float64)
@@ -246,7 +248,7 @@ def test_a_3mf_is_read_in_mm_with_colours(scan: Clouds) -> None:
     assert objects.MoveNext()
     found = objects.GetCurrentMeshObject()
     np.testing.assert_allclose(
-        [list(vertex.Coordinates) for vertex in found.GetVertices()], mesh.vertices_mm, rtol=0, atol=3e-5
+        [list(vertex.Coordinates) for vertex in found.GetVertices()], mesh.vertices_mm * [1, -1, -1], rtol=0, atol=3e-5
     )
     np.testing.assert_array_equal([list(triangle.Indices) for triangle in found.GetTriangleIndices()], mesh.faces)
     triangles = found.GetAllTriangleProperties()

@@ -55,7 +55,7 @@ def covered_shares(rig: Path) -> list[float]:
     decoded = (frames.contrast > 20) & (np.abs(bits - inverses) >= LEAST_SWING).all(axis=0)
     loaded: Any = trimesh.load(rig.parent / "out" / "mesh.ply", process=False)
     device = bundle.calibration.cameras["camera0"]
-    placed = placed_vertices(np.asarray(loaded.vertices, np.float64), device)
+    placed = placed_vertices(np.asarray(loaded.vertices, np.float64) * [1, -1, -1], device)
     met = rasterise(placed, np.asarray(loaded.faces, np.int32), device.size).face >= 0
     left = np.indices(met.shape)[1] < met.shape[1] / 2
     return [float((met & decoded & part).sum() / (decoded & part).sum()) for part in (left, ~left)]

@@ -158,7 +158,7 @@ def test_a_scan_with_the_example_beside_broken_plug_ins_is_a_plane_at_its_distan
     result = CliRunner().invoke(app, ["scan", "--url", service.url, "--output", str(output)])
     assert result.exit_code == 0, result.output
     mesh = trimesh.load(output / "mesh.ply", process=False)
-    off_mm = np.abs(np.asarray(mesh.vertices)[:, 2] - DISTANCE_MM)
+    off_mm = np.abs(np.asarray(mesh.vertices)[:, 2] + DISTANCE_MM)
     assert len(off_mm) > 20_000
     assert np.median(off_mm) < 0.2
     assert np.percentile(off_mm, 99) < 1.0

@@ -152,7 +152,7 @@ def faults(stand: Stand) -> dict[str, str]:
 def right_mesh(stand: Stand, record: dict[str, Any]) -> None:
     data = stand.client.scans.file(record["id"], "mesh.ply")
     mesh = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
-    depths_mm = mesh.vertices[:, 2]
+    depths_mm = -mesh.vertices[:, 2]
     assert len(depths_mm) > 1000
     assert abs(depths_mm - WALL_MM).max() < 5.0
 

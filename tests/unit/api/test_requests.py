@@ -209,6 +209,7 @@ def test_plan_is_the_request_over_the_rig_file_over_the_default(client: TestClie
         "smooth_boundary": True,
         "axis": None,
         "drop_finest_bits": 0,
+        "mesh_axes": "upright",
     }
     # The rig file's exposure belongs to its cameras, not to the plan.
     assert (plan["exposures_s"], plan["exposure_s"]) == ([0.08, 0.02], None)

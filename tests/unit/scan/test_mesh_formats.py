@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from slrig.errors import InvalidInputError, StorageError
-from slrig.model import Mesh, PointCurves, Refusal, Size
+from slrig.model import Mesh, MeshAxes, PointCurves, Refusal, Size
 from slrig.scan import formats as mesh_formats
 from slrig.scan.artefacts import (
     MESH,
@@ -43,7 +44,7 @@ from slrig.scan.formats import (
 )
 
 ENCODERS: Mapping[str, Callable[[Mesh], bytes | bytearray]] = {
-    "ply": encode_mesh_ply,
+    "ply": partial(encode_mesh_ply, axes=MeshAxes.RIG),
     "glb": encode_mesh_glb,
     "stl": encode_mesh_stl,
     "obj": encode_mesh_obj,
@@ -460,7 +461,7 @@ def example_curves() -> PointCurves:
 
 def test_ply_holds_every_property_of_the_mesh() -> None:
     mesh = example_mesh()
-    found = load(encode_mesh_ply(mesh), "ply")
+    found = load(encode_mesh_ply(mesh, axes=MeshAxes.RIG), "ply")
     data = found.metadata["_ply_raw"]["vertex"]["data"]
     assert np.array_equal(found.vertices, mesh.vertices_mm)
     assert np.array_equal(found.faces, mesh.faces)
@@ -487,9 +488,10 @@ def test_ply_header_names_the_unit_and_the_layout() -> None:
     ]
 
 
-def test_ply_is_read_again_as_it_was_written() -> None:
+@pytest.mark.parametrize("axes", MeshAxes)
+def test_ply_is_read_again_as_it_was_written(axes: MeshAxes) -> None:
     mesh = example_mesh()
-    found = decode_mesh_ply(encode_mesh_ply(mesh))
+    found = decode_mesh_ply(encode_mesh_ply(mesh, axes=axes))
     for name in ("vertices_mm", "faces", "normals", "colour", "mark", "sigma_mm", "stripe"):
         before, after = getattr(mesh, name), getattr(found, name)
         assert after.dtype == before.dtype
@@ -524,12 +526,38 @@ def test_a_ply_that_was_changed_or_cut_is_refused(old: bytes, new: bytes) -> Non
         decode_mesh_ply(data + b"x")
 
 
-@pytest.mark.parametrize("name", ON_REQUEST)
-def test_other_formats_are_made_of_the_ply_beside_them(tmp_path: Path, name: str) -> None:
+def test_files_for_viewers_have_y_up_and_z_towards_the_viewer() -> None:
+    mesh, curves, normals = half_ball(), example_curves(), example_normals()
+    found = load(encode_mesh_ply(mesh), "ply")
+    # A turn by 180 degrees about x, so that triangles keep their front.
+    turned = np.diag([1, -1, -1])
+    assert np.array_equal(found.vertices, mesh.vertices_mm @ turned)
+    assert ((found.face_normals * (found.triangles_center - [3, 4, -500])).sum(axis=1) > 45).all()
+    points = load(encode_points_ply(curves, normals), "ply")
+    assert points.vertices == pytest.approx(curves.points_mm @ turned, rel=1e-6)
+    assert points.metadata["_ply_raw"]["vertex"]["data"]["nz"].ravel()[[0, 1]].tolist() == [1, np.float32(0.8)]
+
+
+def test_a_ply_of_an_earlier_version_is_in_the_axes_of_the_calibration() -> None:
     mesh = example_mesh()
-    (tmp_path / MESH).write_bytes(encode_mesh_ply(mesh))
+    data = encode_mesh_ply(mesh, axes=MeshAxes.RIG)
+    (stated,) = [line for line in data.split(b"\n") if line.startswith(b"comment axes")]
+    found = decode_mesh_ply(data.replace(stated + b"\n", b"", 1))
+    assert np.array_equal(found.vertices_mm, mesh.vertices_mm)
+    with pytest.raises(InvalidInputError, match="another header"):
+        decode_mesh_ply(data.replace(stated, b"comment axes others", 1))
+
+
+@pytest.mark.parametrize("name", ON_REQUEST)
+@pytest.mark.parametrize("axes", MeshAxes)
+def test_other_formats_are_made_of_the_ply_beside_them(tmp_path: Path, name: str, axes: MeshAxes) -> None:
+    mesh = example_mesh()
+    (tmp_path / MESH).write_bytes(encode_mesh_ply(mesh, axes=axes))
     write_converted(tmp_path, name)
-    assert (tmp_path / name).read_bytes() == ON_REQUEST[name](mesh)
+    upright = axes is MeshAxes.UPRIGHT and not name.endswith(".glb")
+    turn = np.array([1, -1, -1] if upright else [1, 1, 1], dtype=np.float32)
+    placed = replace(mesh, vertices_mm=mesh.vertices_mm * turn, normals=mesh.normals * turn)
+    assert (tmp_path / name).read_bytes() == ON_REQUEST[name](placed)
     (tmp_path / "mesh.ply").unlink()
     with pytest.raises(StorageError, match=r"mesh\.ply: the disk refused"):
         write_converted(tmp_path, name)
@@ -547,7 +575,7 @@ def example_normals() -> NDArray[np.float32]:
 def test_points_hold_their_column_source_and_bridges() -> None:
     curves = example_curves()
     normals = example_normals()
-    found = load(encode_points_ply(curves, normals), "ply")
+    found = load(encode_points_ply(curves, normals, axes=MeshAxes.RIG), "ply")
     data = found.metadata["_ply_raw"]["vertex"]["data"]
     assert found.vertices == pytest.approx(curves.points_mm, rel=1e-6)
     for axis, name in enumerate(("nx", "ny", "nz")):
