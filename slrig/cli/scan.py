@@ -209,7 +209,8 @@ def tell_result(scan: Mapping[str, Any], output: Path, *, files: tuple[str, ...]
 START_LIMIT_S = 120.0
 STOP_LIMIT_S = 10.0
 _POLL_S = 0.05
-_SERVICE_SHARE = 0.05
+_OPENING_SHARE, _SERVICE_SHARE = 0.15, 0.5
+"""Of a demonstration's time: until the service has started, and until the rig is rendered and open."""
 LABEL = "demo"
 
 
@@ -346,7 +347,7 @@ def _await_ready(process: subprocess.Popen[bytes], client: Client, data: Path, d
         if missing != told:
             # A slow machine is no reason to give up, as long as it gets on.
             told, deadline = missing, time.monotonic() + START_LIMIT_S
-            display("opening the rig", 0.0, missing)
+            display("opening the rig", _OPENING_SHARE, missing)
         _require_alive(process, data, deadline)
         time.sleep(_POLL_S)
 

@@ -389,7 +389,7 @@ _ENDED = "its process ended (if the machine ran out of memory, free some)"
 SILENCE_TOLD_S = 5.0
 """From when on `condition` tells that the process shows no sign of life."""
 
-LOADING = "loading the numerical code (compiled the first time, which takes a minute or more)"
+LOADING = "loading the numerical code (a minute or more where it has to be compiled)"
 READY = "ok"
 
 WAITING = "waiting for the worker"
