@@ -24,6 +24,7 @@ from rich.progress import (
 from rich.table import Column, Table
 from rich.text import Text
 
+from slrig.jobs.listener import PREPARING
 from slrig.printable import printable
 
 _FIRST_SHARE = 0.2
@@ -32,13 +33,14 @@ EVERY_S = 2.0
 """How often a line tells of a stage that goes on, where there is no bar."""
 
 
-def time_left(elapsed_s: float, fraction: float) -> str:
-    """How long work will go on, by what it took so far; "" before a fifth is done, and at the end.
+def time_left(elapsed_s: float, fraction: float, stage: str = "") -> str:
+    """How long work will go on, by what it took so far; "" before a fifth is done, at the end, and while kernels are
+    compiled.
 
     >>> time_left(10.0, 0.1), time_left(10.0, 0.25), time_left(100.0, 0.4)
     ('', 'about 30 s left', 'about 2 min 30 s left')
     """
-    if not _FIRST_SHARE <= fraction < 1.0:
+    if not _FIRST_SHARE <= fraction < 1.0 or PREPARING in stage:
         return ""
     minutes, seconds = divmod(round(elapsed_s * (1 / fraction - 1)), 60)
     return f"about {f'{minutes} min ' if minutes else ''}{seconds} s left"
@@ -49,7 +51,7 @@ class _TimeLeft(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         """Return the words of now."""
-        return Text(time_left(task.elapsed or 0.0, task.completed / (task.total or 1.0)))
+        return Text(time_left(task.elapsed or 0.0, task.completed / (task.total or 1.0), task.description))
 
 
 class ProgressDisplay:
@@ -133,7 +135,7 @@ class ProgressDisplay:
         self._told_s = time.monotonic()
         stage, fraction, detail = self._now
         line = f"{self._told_s - self._began_s:6.1f} s  {fraction:4.0%}  {stage}"
-        left = time_left(self._told_s - self._began_s, fraction)
+        left = time_left(self._told_s - self._began_s, fraction, stage)
         words = ", ".join(each for each in (detail, left) if each)
         print(f"{line:<40}{words}".rstrip(), file=self._stream, flush=True)
 

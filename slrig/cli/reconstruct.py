@@ -21,8 +21,8 @@ from slrig.cli.display import ProgressDisplay, counted, print_table, progress_sh
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError, ExtraMissingError
 from slrig.failure import UNEXPECTED, job_failure
-from slrig.jobs.listener import Listener
-from slrig.jobs.worker import PREPARING, prepare_kernel_cache
+from slrig.jobs.listener import PREPARING, Listener
+from slrig.jobs.worker import prepare_kernel_cache
 from slrig.logs import set_up_console_logs
 from slrig.scan.artefacts import MESH, ON_REQUEST, REPORT, report_summary, write_converted
 from slrig.scan.formats import BUNDLE_ZIP, CALIBRATION_USED, missing_for, offered, on_demand

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 from slrig.errors import ScanCancelledError
 
+PREPARING = "preparing kernels"
+"""Stage in which kernels are compiled, which happens once, and takes a time that is not known ahead."""
+
 
 def _silent(_stage: str, _fraction: float, _detail: str) -> None:
     pass

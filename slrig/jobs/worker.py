@@ -33,7 +33,7 @@ from slrig.capture import EvidenceSummary
 from slrig.errors import ScanCancelledError, WorkerBusyError, WorkerLostError
 from slrig.failure import JobFailure, errors_by_code, interruption_error, job_failure
 from slrig.jobs.job import FedCaptures, FrameFeed, Job, JobRun
-from slrig.jobs.listener import SILENT, Listener
+from slrig.jobs.listener import PREPARING, SILENT, Listener
 from slrig.logs import LogSettings, set_up_logs
 from slrig.model import Region
 
@@ -268,9 +268,6 @@ step of the mathematics holds the interpreter for more than a second or two; a m
 STANDSTILL_LIMIT_S = 900.0
 """A job that tells no progress this long is taken for one that never ends: the longest step that was measured, a solve
 of sixty poses, takes about a minute."""
-
-PREPARING = "preparing kernels"
-"""The stage of compiling what numba has not compiled on this machine before."""
 
 POLL_S = 0.1
 
