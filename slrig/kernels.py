@@ -58,7 +58,10 @@ def best_cpu_level() -> str | None:
     """Name by which LLVM knows the level of this processor: of x86-64 or, on aarch64, "generic"; None for others."""
     if platform.machine() == "aarch64":
         return "generic"
-    features = llvmlite.binding.get_host_cpu_features()
+    try:
+        features = llvmlite.binding.get_host_cpu_features()
+    except RuntimeError:  # LLVM cannot tell
+        return None
     has = {name for name, there in features.items() if there}
     return next((level for level, needed in CPU_LEVELS.items() if needed <= has), None)
 

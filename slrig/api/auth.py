@@ -273,6 +273,7 @@ SESSION_LIFE = timedelta(hours=12)
 """A working day."""
 LINK_LIFE = timedelta(minutes=15)
 MOST_SESSIONS = 256
+_MOST_LINKS = 8
 
 router = APIRouter(prefix="/session", tags=["session"])
 
@@ -287,7 +288,7 @@ class Session:
 
 
 class Sessions:
-    """Who is logged in. Lives on the event loop's thread, but for `link`, which is made before the loop runs."""
+    """Who is logged in. Lives on the event loop's thread, but for the first `link`, made before the loop runs."""
 
     def __init__(self, ring: KeyRing, *, cookie: str, clock: Clock = utc_now) -> None:
         self.ring = ring
@@ -298,10 +299,14 @@ class Sessions:
         self._shares = Shares("sessions", MOST_SESSIONS, "Log out in a browser that is not used.", retry_s=60)
         self._links: dict[str, Session] = {}
 
-    def link(self, name: str) -> str:
-        """A secret that opens one session by the key of a name."""
-        secret, key = secrets.token_urlsafe(32), self.ring.named(name)
-        self._links[digest(secret)] = Session(name, "" if key is None else key.digest, self._clock() + LINK_LIFE)
+    def link(self, name: str, key: str) -> str:
+        """A secret that opens one session by a key, within a quarter of an hour. Of one key the newest few count."""
+        secret, now = secrets.token_urlsafe(32), self._clock()
+        self._links = {each: link for each, link in self._links.items() if link.expires_at > now}
+        earlier = [each for each, link in self._links.items() if link.key == key]
+        for each in earlier[: max(len(earlier) - _MOST_LINKS + 1, 0)]:
+            del self._links[each]
+        self._links[digest(secret)] = Session(name, key, now + LINK_LIFE)
         return secret
 
     def follow(self, secret: str) -> tuple[str, Session] | None:
@@ -382,6 +387,22 @@ async def close_session(request: Request, response: Response) -> None:
         response.delete_cookie(sessions.cookie, path="/", httponly=True, samesite="strict")
 
 
+class LinkBody(BaseModel):
+    """A path of this service that logs one browser in, once, within a quarter of an hour."""
+
+    path: str
+
+
+@router.post("/links", status_code=201, responses=problems(409))
+async def make_link(request: Request) -> LinkBody:
+    """Make a link by which a browser logs in as you: a program opens it for the person before it."""
+    caller = request.state.caller
+    sessions: Sessions | None = request.app.state.sessions
+    if sessions is None:
+        raise HTTPException(409, "This service asks nobody for a key, so there is nothing to log in to.")
+    return LinkBody(path=f"{LINK_PATH}?token={sessions.link(caller.name, caller.key)}")
+
+
 @router.get(
     "/link",
     response_class=Response,
@@ -390,7 +411,7 @@ async def close_session(request: Request, response: Response) -> None:
     openapi_extra={"security": []},
 )
 async def follow_link(request: Request, token: Annotated[str, Query(max_length=200)]) -> Response:
-    """Log a browser in by the link that `slrig serve` prints. It works once, for a quarter of an hour."""
+    """Log a browser in by the link that `slrig serve` prints or POST makes. It works once, for a quarter of an hour."""
     sessions: Sessions | None = request.app.state.sessions
     opened = None if sessions is None else sessions.follow(token)
     if sessions is None or opened is None:

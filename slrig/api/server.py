@@ -537,9 +537,10 @@ def _tell_keys(
     if sys.stdout.isatty():
         if key is not None:
             say(f"API key, shown only now: {key}\nIn the terminal of the client: export {KEY_VARIABLE}={key}")
-        owner = next((each.name for each in ring.everybody if each.fault(utc_now()) is None), None)
+        owner = next((each for each in ring.everybody if each.fault(utc_now()) is None), None)
         if owner is not None:
-            say(f"In a browser, once, within a quarter of an hour: {url}{LINK_PATH}?token={sessions.link(owner)}")
+            secret = sessions.link(owner.name, owner.digest)
+            say(f"In a browser, once, within a quarter of an hour: {url}{LINK_PATH}?token={secret}")
     elif key is not None:
         path = folder.root / _FIRST_KEY_FILE
         write_file(path, f"{key}\n".encode("ascii"))

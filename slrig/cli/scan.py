@@ -225,7 +225,7 @@ def run_demo(rig: Path, output: Path, data: Path | None, *, show: bool) -> None:
     data = data_home() / "demo" if data is None else data
     with ExitStack() as stack:
         with progress_shown() as display:
-            client = stack.enter_context(rig_service(rig, data, display, no_key=show))
+            client = stack.enter_context(rig_service(rig, data, display))
             scan = scan_with(client, {"label": LABEL}, output, Listener(report=display).within(_SERVICE_SHARE, 1.0))
             removed = remove_earlier(client, scan)
         tell_result(scan, output)
@@ -234,7 +234,7 @@ def run_demo(rig: Path, output: Path, data: Path | None, *, show: bool) -> None:
         if removed:
             typer.echo(f"Note: {counted(removed, 'earlier demo scan')} of rig '{scan['rig']}' removed from there.")
         if show:
-            _show_page(f"{_url(data)}/#/scan/{scan['id']}")
+            _show_page(f"{_url(data)}{client.system.make_link()['path']}#/scan/{scan['id']}")
         else:
             _tell_next(rig, data / "scans" / scan["id"] / "bundle", output)
     require_sound(scan)
@@ -249,13 +249,11 @@ def _show_page(address: str) -> None:
 
 
 @contextmanager
-def rig_service(rig: Path, data: Path, display: ProgressDisplay, *, no_key: bool = False) -> Iterator[Client]:
+def rig_service(rig: Path, data: Path, display: ProgressDisplay) -> Iterator[Client]:
     """A client of a service that holds the rig of a file as long as the block lasts, in a process of its own.
 
-    data : its data folder, which is made. no_key : programs and browsers of this machine need no key.
-
-    Raises ServiceError: it does not start, or the rig cannot be opened; ConfigError: there is no such rig file;
-    StorageError.
+    data : its data folder, which is made. Raises ServiceError: it does not start, or the rig cannot be opened;
+    ConfigError: there is no such rig file; StorageError.
     """
     if not rig.is_file():
         message = (
@@ -267,10 +265,7 @@ def rig_service(rig: Path, data: Path, display: ProgressDisplay, *, no_key: bool
         data.mkdir(parents=True, exist_ok=True)
     key = secrets.token_urlsafe(32)
     display("starting the service", 0.0, str(rig))
-    with (
-        _service(rig, data, key, ["--no-key"] if no_key else []) as process,
-        Client(_await_address(process, data), key) as client,
-    ):
+    with _service(rig, data, key) as process, Client(_await_address(process, data), key) as client:
         _await_ready(process, client, data, display)
         yield client
 
@@ -299,9 +294,9 @@ def require_sound(scan: Mapping[str, Any]) -> None:
 
 
 @contextmanager
-def _service(rig: Path, data: Path, key: str, options: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
+def _service(rig: Path, data: Path, key: str) -> Iterator[subprocess.Popen[bytes]]:
     (data / "service.json").unlink(missing_ok=True)
-    command = [sys.executable, "-m", "slrig.cli", "serve", str(rig), "--port", "0", "--until-eof", *options]
+    command = [sys.executable, "-m", "slrig.cli", "serve", str(rig), "--port", "0", "--until-eof"]
     with (data / "service.log").open("wb") as log:
         process = subprocess.Popen(  # noqa: S603 - our own command
             [*command, "--host", "127.0.0.1", "--data", str(data)],

@@ -811,6 +811,10 @@ class System(Resource):
         """Log out."""
         self._connection.send("DELETE", "/session")
 
+    def make_link(self) -> Json:
+        """Make a link, `path`, by which a browser logs in as this client, once, within a quarter of an hour."""
+        return self._connection.json("POST", "/session/links")
+
     def follow_link(self, token: str) -> None:
         """Log in with the token of the link that `slrig serve` printed."""
         self._connection.send("GET", "/session/link", params={"token": token})

@@ -33,6 +33,7 @@ from slrig.api.auth import (
     Rates,
     Refused,
     Sessions,
+    digest,
     first_key,
     local_key,
 )
@@ -432,7 +433,7 @@ def test_a_browser_logs_in_and_out(served: ServedBench) -> None:
 
 @pytest.mark.usefixtures("client")
 def test_the_link_works_once_and_not_for_long(served: ServedBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    token = sessions(served).link("environment")
+    token = sessions(served).link("environment", digest(KEY))
     browser = stranger(served)
     response = browser.get(f"{LINK_PATH}?token={token}", follow_redirects=False)
     assert (response.status_code, response.headers["location"]) == (303, "/")
@@ -440,10 +441,24 @@ def test_the_link_works_once_and_not_for_long(served: ServedBench, monkeypatch: 
     for used in (token, "none-such", ""):
         refused = stranger(served).get(f"{LINK_PATH}?token={used}", follow_redirects=False)
         assert (refused.status_code, refused.headers["content-type"]) == (401, "application/problem+json")
-    late = sessions(served).link("environment")
+    late = sessions(served).link("environment", digest(KEY))
     now = sessions(served)._clock()
     monkeypatch.setattr(sessions(served), "_clock", lambda: now + timedelta(minutes=16))
     assert stranger(served).get(f"{LINK_PATH}?token={late}", follow_redirects=False).status_code == 401
+
+
+def test_a_program_makes_a_link_for_the_person_before_it(
+    client: TestClient, served: ServedBench, ring: KeyRing
+) -> None:
+    paths = [client.post("/session/links").json()["path"] for _ in range(9)]
+    other = client.post("/session/links", headers={"Authorization": f"Bearer {ring.add('Ann', [])}"}).json()["path"]
+    browser = stranger(served)
+    assert browser.get(paths[-1], follow_redirects=False).status_code == 303
+    assert browser.get("/session").json()["name"] == "environment"
+    # The newest eight of a key count, whatever others have.
+    answers = [stranger(served).get(path, follow_redirects=False).status_code for path in (*paths[:2], other)]
+    assert answers == [401, 303, 303]
+    assert stranger(served).post("/session/links").status_code == 401
 
 
 @pytest.mark.usefixtures("client")
@@ -491,9 +506,10 @@ def test_a_session_ends_with_its_time_and_with_its_key(
     served: ServedBench, ring: KeyRing, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     browser = stranger(served)
-    browser.post("/session", headers={"Authorization": f"Bearer {ring.add('Ann', [])}"})
+    ann = ring.add("Ann", [])
+    browser.post("/session", headers={"Authorization": f"Bearer {ann}"})
     assert browser.get("/scan").status_code == 200
-    link = sessions(served).link("Ann")
+    link = sessions(served).link("Ann", digest(ann))
     ring.revoke("Ann")
     assert browser.get("/scan").status_code == 401
     # Nor do session and link live again with the next key of that name, which may do more.
