@@ -56,6 +56,8 @@ def test_streams_of_a_command_end_with_it(tmp_path: Path, name: str) -> None:
     for reader in readers:
         reader.join(PATIENCE_S.get(name, 2.0))
     assert [reader for reader in readers if reader.is_alive()] == []
+    command.stdout.close()
+    command.stderr.close()
     # What it says, and to refuse, is of other tests.
     assert code in {0, 1, 2, -signal.SIGKILL}, b"".join(said)
     if name == "report":
