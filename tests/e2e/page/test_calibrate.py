@@ -28,6 +28,11 @@ def choose_board(page: Page) -> None:
     page.get_by_label("Side of a square").fill("20")
 
 
+def shows_the_live_picture(page: Page) -> None:
+    picture = page.get_by_role("img", name="Live picture of camera left")
+    page.wait_for_function("image => image.naturalWidth > 0", arg=picture.element_handle())
+
+
 def test_a_rig_is_calibrated_from_a_board_to_its_use(start: Start, tmp_path: Path, visit: Visit) -> None:
     service = start(write_rig(tmp_path / "rig"))
     # A scan that could not be reconstructed is not offered, and what helps is.
@@ -67,6 +72,7 @@ def test_a_rig_is_calibrated_from_a_board_to_its_use(start: Start, tmp_path: Pat
     page.get_by_text("10 poses accepted. Still wanted:").wait_for()
     page.get_by_text("40 of 40 corners").first.wait_for()
     page.get_by_role("img", name="left: 78 % of the image covered").wait_for()
+    shows_the_live_picture(page)
     looks_as_kept(page, "calibrate-poses")
 
     page.get_by_role("button", name="Solve").click()
@@ -109,8 +115,7 @@ def test_one_person_shoots_from_two_metres_away(start: Start, tmp_path: Path, vi
         caller.post(calibration["links"]["pose"], 202, position=1)
         page = visit(service, f"calibrate/{calibration['id']}", size=PHONE, dark=True, ignored="409")
         page.get_by_text("✓ Pose 1 accepted").wait_for()
-        picture = page.get_by_role("img", name="Live picture of camera left")
-        page.wait_for_function("image => image.naturalWidth > 0", arg=picture.element_handle())
+        shows_the_live_picture(page)
         page.get_by_text("the board goes here").wait_for()
         looks_as_kept(page, "calibrate-phone-dark")
 
