@@ -50,8 +50,9 @@ FIRST_NAME = "owner"
 """Whom the key belongs to that the service makes at its first start."""
 
 GIVEN_NAME = "environment"
-LOCAL_NAME = "local"
 """Whom the key of the environment belongs to."""
+LOCAL_NAME = "local"
+"""Whom the key for programs of the same user belongs to, see `local_key`."""
 
 KEY_NAME = r"^[A-Za-z0-9][A-Za-z0-9 ._@-]{0,63}$"
 
@@ -288,7 +289,7 @@ class Session:
 
 
 class Sessions:
-    """Who is logged in. Lives on the event loop's thread, but for the first `link`, made before the loop runs."""
+    """Open sessions of browsers, and links that open one. Used on the event loop's thread, or before it runs."""
 
     def __init__(self, ring: KeyRing, *, cookie: str, clock: Clock = utc_now) -> None:
         self.ring = ring
@@ -351,6 +352,14 @@ class Sessions:
         self._open.pop(digest(secret), None)
 
 
+def _require_sessions(request: Request) -> Sessions:
+    """Return the sessions of this service. Raises HTTPException 409: it needs no key."""
+    sessions: Sessions | None = request.app.state.sessions
+    if sessions is None:
+        raise HTTPException(409, "This service needs no key, so there is nothing to log in to.")
+    return sessions
+
+
 class SessionBody(BaseModel):
     """Whom the service takes the sender for, what that name may do, and until when; null is without end."""
 
@@ -369,10 +378,7 @@ async def look_at_session(request: Request) -> SessionBody:
 @router.post("", status_code=201)
 async def open_session(request: Request, response: Response) -> SessionBody:
     """Log a browser in: send the key in a header, as always, and go on with the cookie that comes back."""
-    caller = request.state.caller
-    sessions: Sessions | None = request.app.state.sessions
-    if sessions is None:
-        raise HTTPException(409, "This service asks nobody for a key, so there is nothing to log in to.")
+    caller, sessions = request.state.caller, _require_sessions(request)
     secret, session = sessions.open(caller.name, caller.key)
     _set_cookie(request, response, sessions, secret)
     return SessionBody(name=caller.name, scopes=caller.scopes, expires_at=session.expires_at)
@@ -396,10 +402,7 @@ class LinkBody(BaseModel):
 @router.post("/links", status_code=201, responses=problems(409))
 async def make_link(request: Request) -> LinkBody:
     """Make a link by which a browser logs in as you: a program opens it for the person before it."""
-    caller = request.state.caller
-    sessions: Sessions | None = request.app.state.sessions
-    if sessions is None:
-        raise HTTPException(409, "This service asks nobody for a key, so there is nothing to log in to.")
+    caller, sessions = request.state.caller, _require_sessions(request)
     return LinkBody(path=f"{LINK_PATH}?token={sessions.link(caller.name, caller.key)}")
 
 

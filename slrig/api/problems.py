@@ -189,9 +189,12 @@ async def _slrig_error(_request: Request, error: Exception) -> JSONResponse:
 async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
     if not isinstance(error, RequestValidationError):
         raise error
+    faults = error.errors()
+    known: Sequence[str] = ()
     body = getattr(request.scope.get("route"), "body_field", None)
-    known = () if body is None else model_keys(TypeAdapter(body.field_info.annotation))
-    found = field_faults(error.errors(), known)
+    if body is not None and any(fault["type"] == "extra_forbidden" for fault in faults):
+        known = model_keys(TypeAdapter(body.field_info.annotation))
+    found = field_faults(faults, known)
     names = ", ".join(fault["field"] for fault in found)
     noun = "fault" if len(found) == 1 else "faults"
     detail = f"The request has {len(found)} {noun}: {names}. See errors."

@@ -66,7 +66,7 @@ def actor() -> str | None:
 
 
 ANYONE = "anyone"
-"""Who asks a service that asks nobody for a key."""
+"""Name of every caller of a service that needs no key."""
 
 
 def has_share(total: int, who: str | None, holders: Collection[str | None]) -> bool:

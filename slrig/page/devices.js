@@ -82,7 +82,7 @@ function You({may}) {
   const [audit, problem] = useValue(may("administer") ? "/audit?limit=10" : null, 10);
   if (!session) return null;
   return html`<h2>You</h2>
-    <p>${session.name === "anyone" ? "This service asks nobody for a key." : html`Logged in as <strong>${session.name}</strong>, ${session.expires_at ? `until ${new Date(session.expires_at).toLocaleString("en-GB", {dateStyle: "medium", timeStyle: "short"})}` : "without end"}.`}
+    <p>${session.name === "anyone" ? "This service needs no key." : html`Logged in as <strong>${session.name}</strong>, ${session.expires_at ? `until ${new Date(session.expires_at).toLocaleString("en-GB", {dateStyle: "medium", timeStyle: "short"})}` : "without end"}.`}
       ${" "}You may ${session.scopes.join(", ")}.</p>
     <${Refusal} problem=${problem?.status ? problem : null} />
     ${audit && html`<div class="wide" tabindex="0" role="region" aria-label="Who did what last"><table class="broad"><caption>Who did what last</caption>

@@ -455,7 +455,7 @@ def test_a_program_makes_a_link_for_the_person_before_it(
     browser = stranger(served)
     assert browser.get(paths[-1], follow_redirects=False).status_code == 303
     assert browser.get("/session").json()["name"] == "environment"
-    # The newest eight of a key count, whatever others have.
+    # The newest eight links of a key work; those of other keys do not count.
     answers = [stranger(served).get(path, follow_redirects=False).status_code for path in (*paths[:2], other)]
     assert answers == [401, 303, 303]
     assert stranger(served).post("/session/links").status_code == 401
@@ -576,7 +576,7 @@ def test_programs_of_the_same_user_here_need_no_key_as_long_as_the_service_runs(
         path = local_key_path(8731)
         assert (path.stat().st_mode & 0o777, path.parent.stat().st_mode & 0o777) == (0o600, 0o700)
         assert sent("http://127.0.0.1:8731") == sent("http://localhost:8731") == f"Bearer {key}"
-        # Neither another service nor another machine is told.
+        # The key is sent neither to another service nor to another machine.
         assert sent("http://127.0.0.1:8732") is sent("http://192.0.2.1:8731") is None
         with pytest.raises(ConfigError, match="of the name 'local' already"):
             ring.add("local", [])
