@@ -85,9 +85,11 @@ def converted(ply: bytes, name: str) -> bytes:
     """One of `ON_REQUEST`, made of a mesh.ply, in its axes; GLB in its own. Raises InvalidInputError: mesh.ply is not
     as slrig wrote it.
     """
-    mesh = decode_mesh_ply(ply)
-    turn = _TURNS[MeshAxes.RIG if name.endswith(".glb") else _axes_of(ply)]
-    return ON_REQUEST[name](replace(mesh, vertices_mm=mesh.vertices_mm * turn, normals=mesh.normals * turn))
+    mesh, axes = decode_mesh_ply(ply), _axes_of(ply)
+    if axes is not MeshAxes.RIG and not name.endswith(".glb"):
+        turn = _TURNS[axes]
+        mesh = replace(mesh, vertices_mm=mesh.vertices_mm * turn, normals=mesh.normals * turn)
+    return ON_REQUEST[name](mesh)
 
 
 def write_report(report: Mapping[str, object], path: Path) -> None:
@@ -150,14 +152,11 @@ def decode_mesh_ply(data: bytes | bytearray) -> Mesh:
     vertex_bytes = vertex_count * kind.itemsize
     length = vertex_bytes + face_count * _FACE.itemsize
     elements = _mesh_elements(kind, vertex_count, face_count)
-    wanted = _ply_header(elements, axes)
-    earlier = _ply_header(elements, None)
-    if head + mark == earlier:
-        wanted = earlier
-    if head + mark != wanted or len(body) != length:
+    as_written = head + mark in (_ply_header(elements, axes), _ply_header(elements, None))
+    if not as_written or len(body) != length:
         message = (
             f"mesh.ply: expected the header that slrig writes and {length} bytes after it, found "
-            f"{'another header' if head + mark != wanted else f'{len(body)} bytes'}; reconstruct the bundle again"
+            f"{f'{len(body)} bytes' if as_written else 'another header'}; reconstruct the bundle again"
         )
         raise InvalidInputError(message)
     vertices = np.frombuffer(body, dtype=kind, count=vertex_count)
@@ -278,7 +277,7 @@ def _vertex_element(vertex: np.dtype[np.void], count: int) -> list[str]:
 
 
 def _ply_header(elements: list[str], axes: MeshAxes | None) -> bytes:
-    """Axes : None for a file of an earlier version, which does not state them."""
+    """Return the header of a PLY. axes : None as an earlier version wrote it, which did not state them."""
     comments = ["comment unit mm", "comment sigma_mm standard deviation along the surface normal"]
     stated = [] if axes is None else [_AXES_WORDS[axes]]
     lines = ["ply", "format binary_little_endian 1.0", *comments, *stated, *elements]
