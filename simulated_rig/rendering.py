@@ -19,6 +19,8 @@ from simulated_rig.transport import LightPaths, RayCaster, build_caster
 from slrig.kernels import kernel
 from slrig.model import CameraTruth, Pinhole, Pixels
 
+_KEPT_BYTES = 64 * 2**20
+
 Weights = dict[int, Float32Array]
 """Weights (H, W) by the index of a level of `optics.LEVELS_PX`: contribution of its image to each pixel."""
 
@@ -157,7 +159,8 @@ class SceneState:
 class _ViewCache:
     """Traced results for one scene snapshot and one camera pose.
 
-    room : image under ambient light alone; last : image under the last requested projector light.
+    room : image under ambient light alone; lights : images under the projector lights requested last, as many as
+    `_KEPT_BYTES` hold, and one at least.
     bounces : light by way of two surfaces, None if the scene has none.
     defocus_weights : weight of each level of defocus at every pixel, for the projector and for the camera.
     """
@@ -168,7 +171,7 @@ class _ViewCache:
         self.paths: LightPaths | None = None
         self.bounces: Bounces | None = None
         self.room: Float32Array | None = None
-        self.last: tuple[LightTable, Float32Array] | None = None
+        self.lights: dict[int, tuple[LightTable, Float32Array]] = {}
         self.defocus_weights: tuple[Weights, Weights] | None = None
         self.truth: CameraTruth | None = None
 
@@ -298,10 +301,14 @@ class CameraView:
             self._cached_light(cache, paths, light)
 
     def _cached_light(self, cache: _ViewCache, paths: LightPaths, light: LightTable) -> Float32Array:
-        # A free-running camera sees the same light repeatedly.
-        if cache.last is None or cache.last[0] is not light:
-            cache.last = (light, self._render_light(cache, paths, light))
-        return cache.last[1]
+        # A free-running camera sees the same light repeatedly, and so does one before a sequence that is repeated.
+        known = cache.lights.pop(id(light), None)
+        if known is None:
+            known = (light, self._render_light(cache, paths, light))
+            while (len(cache.lights) + 1) * known[1].nbytes > _KEPT_BYTES and cache.lights:
+                cache.lights.pop(next(iter(cache.lights)))
+        cache.lights[id(light)] = known
+        return known[1]
 
     def _render_light(self, cache: _ViewCache, paths: LightPaths, light: LightTable) -> Float32Array:
         if light.channel is not None:

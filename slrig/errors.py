@@ -223,6 +223,10 @@ class ScanStateError(SlrigError, code="scan-state"):
     """The scan exists, but its state forbids the call: deleting one that runs, for example."""
 
 
+class LiveStateError(SlrigError, code="live-state"):
+    """There is no live depth, one is under way already, or it is over."""
+
+
 class RigFileChangedError(SlrigError, code="rig-file-changed"):
     """The rig file is not the one that a change was made of: somebody else changed it meanwhile. Nothing is lost."""
 

@@ -29,7 +29,7 @@ MEDIA_TYPE = "application/problem+json"
 _CODES = {
     404: "schedule-not-found camera-not-found calibration-not-found job-not-found preset-not-found",
     409: "rig-busy not-calibrated scan-cancelled calibration-state artefact-not-ready scan-state key-in-flight "
-    "rig-file-changed",
+    "rig-file-changed live-state",
     410: "damaged",
     422: "invalid-input config bundle calibration pattern schedule nothing-to-reconstruct "
     "unsupported-by-device wrong-system pose-refused solve-refused registration-refused stage-refused views-failed "
@@ -72,6 +72,7 @@ _TITLES = {
     "pattern": "The patterns do not fit",
     "scan-evidence": "Frames do not show their patterns",
     "scan-state": "The job does not allow this now",
+    "live-state": "Live depth does not allow this now",
     "schedule": "The schedule cannot be kept",
     "scope": "This key may not do that",
     "service": "The service failed",

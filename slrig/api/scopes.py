@@ -20,6 +20,7 @@ READING = frozenset({"GET", "HEAD", "OPTIONS"})
 _SCOPES = {
     "session": KeyScope.LOOK,
     "scan": KeyScope.SCAN,
+    "live": KeyScope.SCAN,
     "model": KeyScope.SCAN,
     "exposure": KeyScope.SCAN,
     "calibration": KeyScope.CALIBRATE,

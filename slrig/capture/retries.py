@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Sequence
+from typing import Protocol
 
 from slrig.bundle import RefusedFrame
 from slrig.capture.frame_checks import CHECK_CABLE, Contradiction, describe_frame
-from slrig.capture.verifier import Evidence
 from slrig.errors import FrameTimeoutError, ScanEvidenceError
 from slrig.model import Black, Frame, PatternSequence, Shot, White
 
@@ -23,6 +23,30 @@ ALIKE_EACH_TIME = (
 _ORDINALS = ("first", "second", "third")
 
 
+class FrameChecks(Protocol):
+    """Checks the frames of a capture against one another, as `slrig.capture.verifier.Evidence` does."""
+
+    def add_shot(self, shot: Shot) -> tuple[Contradiction, ...]:
+        """Add a frame; return the contradictions that it reveals."""
+        ...
+
+    def retract(self, camera: str, patterns: Collection[int]) -> tuple[int, ...]:
+        """Remove frames; return the patterns removed."""
+        ...
+
+    def came_alike(self, camera: str, patterns: Iterable[int]) -> bool:
+        """True if the frames of these patterns equal their rejected exposures."""
+        ...
+
+    def clear(self) -> None:
+        """Remove all frames."""
+        ...
+
+    def record_refused(self, refused: RefusedFrame) -> None:
+        """Record a rejected exposure."""
+        ...
+
+
 class RetryPolicy:
     """Decides which frames of a capture count, and which patterns to show again to which cameras.
 
@@ -33,7 +57,7 @@ class RetryPolicy:
     def __init__(
         self,
         sequence: PatternSequence,
-        evidence: Evidence,
+        evidence: FrameChecks,
         refused: Callable[[RefusedFrame], None],
         *,
         since_ns: int | None = None,

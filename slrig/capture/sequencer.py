@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, suppress
 
 from slrig.bundle import RefusedFrame
-from slrig.capture.retries import RetryPolicy
+from slrig.capture.retries import FrameChecks, RetryPolicy
 from slrig.capture.streaming import FrameReader, capture_streaming, earliest_change_s
 from slrig.capture.triggering import CaptureSession, capture_by_software, capture_by_wire, differs_from_request
 from slrig.capture.verifier import Evidence
@@ -21,7 +21,7 @@ def capture(
     *,
     cancelled: Callable[[], bool] = lambda: False,
     timeout_s: float = 2.0,
-    evidence: Evidence | None = None,
+    evidence: FrameChecks | None = None,
     refused: Callable[[RefusedFrame], None] = lambda _: None,
     since_ns: int | None = None,
     colour: Collection[str] = (),

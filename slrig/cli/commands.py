@@ -18,6 +18,7 @@ import typer
 import typer.core
 
 from slrig.cli import calibrate, scans, schedule
+from slrig.cli.live import live
 from slrig.cli.model import model, turntable_app
 from slrig.cli.options import (
     AcceptanceOptions,
@@ -697,6 +698,7 @@ def delete(name: Name, service: ServiceOptions) -> None:
 
 
 app.command()(serve)
+app.command()(live)
 app.command()(model)
 app.command()(patterns)
 app.command(name="import")(import_images)

@@ -2,6 +2,7 @@
 
 from slrig.client.client import Client, Cloud, ScanJob, ScanResult
 from slrig.client.connection import Captured, Event, FileReady, PoseChange, Progress, StateChange
+from slrig.client.live import LiveFrame, read_recording
 
 __all__ = [
     "Captured",
@@ -9,9 +10,11 @@ __all__ = [
     "Cloud",
     "Event",
     "FileReady",
+    "LiveFrame",
     "PoseChange",
     "Progress",
     "ScanJob",
     "ScanResult",
     "StateChange",
+    "read_recording",
 ]

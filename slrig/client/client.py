@@ -19,6 +19,7 @@ import httpx2
 
 from slrig.client.connection import Connection, Event, Json, Progress, StateChange, given
 from slrig.client.errors import ScanFailedError
+from slrig.client.live import Live
 from slrig.client.resources import (
     Acceptance,
     CalibrationResource,
@@ -343,6 +344,7 @@ class Client:
         self.models = Models(self.connection)
         self.presets = PresetResource(self.connection)
         self.rig = RigState(self.connection)
+        self.live = Live(self.connection)
         self.examinations = Examinations(self.connection)
         self.calibration = CalibrationResource(self.connection)
         self.health = RigHealth(self.connection)

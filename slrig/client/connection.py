@@ -217,6 +217,15 @@ class Connection:
         except httpx2.TransportError as error:
             raise self._unreachable(error) from error
 
+    @contextmanager
+    def streamed(self, path: str, **request: Any) -> Iterator[Iterator[bytes]]:
+        """The pieces of an answer as they come. Raises ServiceError."""
+        try:
+            with self._stream(path, **request) as response:
+                yield response.iter_bytes()
+        except httpx2.TransportError as error:
+            raise self._unreachable(error) from error
+
     def fetch(self, path: str, target: Path) -> None:
         """Write an answer into a file, whole or not at all. Raises ServiceError, StorageError."""
         partial = staging_name(target)

@@ -21,8 +21,6 @@ import structlog
 
 from slrig.errors import (
     ArtefactNotReadyError,
-    CameraNotFoundError,
-    DeviceBusyError,
     DeviceError,
     InvalidInputError,
     JobNotFoundError,
@@ -52,6 +50,7 @@ from slrig.jobs.records import (
 )
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Compute, job_task
+from slrig.live.room import LiveOptions, LiveRoom, LiveStatus
 from slrig.rig.preview import Light, Previews, Watch
 from slrig.rig.session import ActiveCalibration, RigFacts, RigSession, driver_errors
 from slrig.rig.watchdog import Call, Watchdog
@@ -188,6 +187,7 @@ class JobManager:
         self._computing: list[_Work] = []
         self._ends: list[_End] = []
         self._again: threading.Timer | None = None
+        self.live = LiveRoom(self._wake)
         self._previews = Previews(self._wake)
         self._ending = self._closed = False
         self._closing = threading.Lock()
@@ -390,21 +390,16 @@ class JobManager:
         DeviceError
             The rig is not open, or not yet.
         """
-        self._refuse_while_stuck()
-        facts = self.rig.facts
-        if self.rig.fault is not None:
-            message = f"The rig cannot be opened: {self.rig.fault.message}"
-            raise DeviceError(message)
-        if facts is None:
-            message = "The rig is being opened. Ask again in a moment."
-            raise DeviceBusyError(message)
-        if camera not in facts.cameras:
-            message = f"The rig has no camera '{camera}'; it has {', '.join(facts.cameras)}."
-            raise CameraNotFoundError(message)
-        with self._changed:
-            if self._ending:
-                raise interruption_error()
+        self._require_serving()
+        self.rig.require_camera(camera)
         return self._previews.watch(camera, light, exposure_s)
+
+    def go_live(self, options: LiveOptions) -> LiveStatus:
+        """Begin live depth, which the rig plays while it is idle. Raises as `watch` and `LiveRoom.start` do."""
+        self._require_serving()
+        facts = self.rig.require_camera(options.camera)
+        self.rig.refuse_misfit()
+        return self.live.start(options, facts.cameras[options.camera], facts.projector, self.rig.calibration)
 
     def status(self) -> RigStatus:
         """Return who holds the rig, and how it is. Touches no device."""
@@ -487,9 +482,7 @@ class JobManager:
 
     def _require_place(self, *, wait: bool) -> None:
         """Raise unless a job that needs the rig may stand in line; with the lock held."""
-        self._refuse_while_stuck()
-        if self._ending:
-            raise interruption_error()
+        self._require_serving()
         waiting = self._due()
         ahead = self._active or (waiting[0] if waiting else None)
         if ahead is not None and not wait:
@@ -497,10 +490,12 @@ class JobManager:
         if ahead is not None:
             require_share("in the line for the rig", self.queue_length, [work.by for work in waiting])
 
-    def _refuse_while_stuck(self) -> None:
+    def _require_serving(self) -> None:
         call = self.rig.calls.stuck
         if call is not None:
             raise DeviceError(call.hangs())
+        if self._ending:
+            raise interruption_error()
 
     def _under_way(self) -> list[_Work]:
         """The jobs that have the rig or compute; with the lock held."""
@@ -550,16 +545,19 @@ class JobManager:
     def _next(self) -> _Work | None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._wanted() or self._previews.wanted, self._until_due_s())
+                self._changed.wait_for(lambda: self._wanted() or self._is_watched(), self._until_due_s())
                 if self._ending:
                     return None
                 if self._wanted():
                     self._active = self._due()[0]
                     self._waiting = tuple(each for each in self._waiting if each is not self._active)
                     return self._active
-                looks = self._previews.wanted
-            if looks:
+                watched = self._is_watched()
+            if watched:
                 self._show()
+
+    def _is_watched(self) -> bool:
+        return self.live.wanted or self._previews.wanted
 
     def _run(self, work: _Work) -> None:
         """The first part of a job, and what comes to be of it."""
@@ -636,18 +634,23 @@ class JobManager:
         return True
 
     def _show(self) -> None:
-        """Take pictures for those who look, until a job wants the rig."""
+        """Play live depth, or else take pictures for those who look, until a job wants the rig."""
         try:
             rig = self.rig.open()
             with driver_errors(self.rig.name):
-                self._previews.run(rig, stop=self._wanted)
+                self.live.run(rig, self.rig.calibration, stop=self._wanted)
+                self._previews.run(rig, stop=lambda: self._wanted() or self.live.wanted)
         except BaseException as raised:  # noqa: BLE001 - the owner thread goes on after any failure of a preview
             error = as_error(raised)
             self.rig.let_go(error)
             self._log_unopened(error)
             fault = job_failure(error)
-            self._previews.fail(error if isinstance(error, SlrigError) else DeviceError(fault.message))
+            self._send_away(error if isinstance(error, SlrigError) else DeviceError(fault.message))
             self._log_unopened(self.rig.recover())
+
+    def _send_away(self, error: SlrigError) -> None:
+        self.live.fail(error)
+        self._previews.fail(error)
 
     def _log_unopened(self, error: Exception | None) -> None:
         if isinstance(error, SlrigError):
@@ -910,7 +913,7 @@ class JobManager:
         error = DeviceError(self.rig.give_up(call).message)
         self.rig.darken_from_outside()
         self._cut_off(error, lambda: [work for work in (self._active,) if work is not None])
-        self._previews.fail(error)
+        self._send_away(error)
 
     def _cut_off(self, error: SlrigError, works: Callable[[], list[_Work]]) -> None:
         with self._changed:
@@ -931,7 +934,7 @@ class JobManager:
                 self._end(work, interruption_error())
             self._changed.notify_all()
         self._watchdog.stop()
-        self._previews.fail(interruption_error())
+        self._send_away(interruption_error())
         for work in cut_off:
             self._settle(work)
 

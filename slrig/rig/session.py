@@ -19,7 +19,14 @@ from pydantic import BaseModel, ValidationError
 from slrig.bundle import check_calibration, require_two_rays, write_file
 from slrig.devices import CameraInfo, ProjectorInfo, Rig, Turntable
 from slrig.disk import storage_errors
-from slrig.errors import CalibrationError, DeviceError, StorageError, UnsupportedByDeviceError
+from slrig.errors import (
+    CalibrationError,
+    CameraNotFoundError,
+    DeviceBusyError,
+    DeviceError,
+    StorageError,
+    UnsupportedByDeviceError,
+)
 from slrig.failure import UNEXPECTED, JobFailure, job_failure
 from slrig.model import Calibration, RotationAxis, Size
 from slrig.rig.watchdog import OPEN, OPEN_LIMIT_S, Call, Calls, SettingsInUse, guarded
@@ -245,6 +252,22 @@ class RigSession:
         if active is not None:
             return self._fitting(active)
         return None if self.facts is None else self.facts.calibration
+
+    def require_camera(self, camera: str) -> RigFacts:
+        """Return what the rig is; on any thread. Raises CameraNotFoundError: it has no such camera. DeviceError: it is
+        not open, or not yet.
+        """
+        facts = self.facts
+        if self.fault is not None:
+            message = f"The rig cannot be opened: {self.fault.message}"
+            raise DeviceError(message)
+        if facts is None:
+            message = "The rig is being opened. Ask again in a moment."
+            raise DeviceBusyError(message)
+        if camera not in facts.cameras:
+            message = f"The rig has no camera '{camera}'; it has {', '.join(facts.cameras)}."
+            raise CameraNotFoundError(message)
+        return facts
 
     def misfit(self, active: ActiveCalibration) -> CalibrationError | None:
         """Why a calibration cannot be used with the devices of this rig; None if it can, or before it was open."""

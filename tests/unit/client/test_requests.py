@@ -35,11 +35,12 @@ from tests.unit.client.service import URL, Broken, client_of, event_answer, fail
 DOCUMENT = json.loads((Path(__file__).parents[3] / "config" / "openapi.json").read_text(encoding="utf-8"))
 NEVER_SENT = {"If-None-Match"}
 """Of files: a result keeps what it has fetched."""
-COMPOSED = {"examinations.wait", "models.wait", "system.readiness"}
+COMPOSED = {"examinations.wait", "live.record", "models.wait", "system.readiness"}
 """Methods of several requests."""
 KINDS = {
     "application/json": {"Json", "bytes"},
     "application/pdf": {"bytes"},
+    "application/octet-stream": {"Iterator[LiveFrame]", "bytes"},
     "application/zip": {"bytes"},
     "image/png": {"Picture", "bytes"},
     "image/svg+xml": {"str"},

@@ -1,0 +1,118 @@
+"""/live: depth while the rig is idle, to aim by."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Body, Query, Response
+from fastapi.concurrency import run_in_threadpool
+from pydantic import BaseModel, Field
+from starlette.responses import StreamingResponse
+
+from slrig.api.events import Held
+from slrig.api.problems import problems
+from slrig.api.schemas import filled
+from slrig.api.service import Serving
+from slrig.bundle import Strict
+from slrig.errors import SlrigError
+from slrig.live.room import LiveOptions, LiveStatus, Viewer
+from slrig.live.stream import message
+from slrig.rig.preview import LONGEST_S
+
+_LOOK_S = 0.5
+"""How long one look for a message holds a thread; then the client is asked whether it is still there."""
+_STEP = 3
+_TYPE = "application/octet-stream"
+
+router = APIRouter(prefix="/live", tags=["rig"])
+
+_STREAM: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "Messages, each a head of eight bytes (two little-endian uint32: lengths of a JSON text and of "
+        "the bytes after it), the text, the bytes. `kind` is `geometry` first (deflated float32 (height, width, 2), "
+        "x/z and y/z of each pixel), then `depth` (deflated planes of one byte a pixel: low and high bytes of the "
+        "differences along each row of q, modulo 65536; a code of σ; `state`; grey), `wait` when none comes, and `end` "
+        "with its `reason`. Depth along the camera's axis: near_mm + (q − 1) unit_mm, none where q is 0; σ: 0.0001 mm "
+        "· 1.05^(code − 1), none where it is 0; state: 0 measured, 1 moved, 2 saturated, 3 dark, 4 unclear, 5 unseen.",
+        "content": {_TYPE: {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+
+
+class LiveRequest(Strict):
+    """Live depth of one camera."""
+
+    camera: str | None = Field(default=None, max_length=64, description="default: the first of the rig")
+    step: int | None = Field(
+        default=None, ge=1, le=16, description="pixels from one decoded point to the next. Default: all, up to 1.5 Mpx"
+    )
+    exposure_s: float | None = Field(default=None, gt=0, le=LONGEST_S, description="default: the rig file's")
+
+
+class LiveBody(BaseModel):
+    """Live depth as it is."""
+
+    camera: str
+    step: int
+    patterns: int = Field(description="of one cycle")
+    viewers: int
+    playing: bool = Field(description="false while a job holds the rig; it goes on afterwards")
+    depth_per_s: float | None
+    facts: dict[str, Any] | None = Field(description="of the newest depth image")
+    links: dict[str, str]
+
+
+@router.get("", responses=problems(409))
+def look_at_live(service: Serving) -> LiveBody:
+    """Return the live depth that there is."""
+    return _body(service.manager.live.status())
+
+
+@router.post("", status_code=201, responses=problems(409, 502, 503))
+def start_live(service: Serving, request: Annotated[LiveRequest, Body(default_factory=LiveRequest)]) -> LiveBody:
+    """Begin live depth: the rig repeats a short sequence while it is idle. Unwatched for 10 s, it ends."""
+    camera = request.camera
+    if camera is None:
+        facts = service.manager.rig.facts
+        camera = next(iter(facts.cameras), "") if facts is not None else ""
+    return _body(service.manager.go_live(LiveOptions(camera, request.step, request.exposure_s)))
+
+
+@router.delete("", status_code=204)
+def end_live(service: Serving) -> None:
+    """End live depth, if there is any. The projector is dark when the exposure under way is over."""
+    service.manager.live.end()
+
+
+@router.get("/depth", response_class=Response, responses={**_STREAM, **problems(409, 429)})
+async def watch_live(
+    held: Held,
+    service: Serving,
+    step: Annotated[int, Query(ge=1, le=64, description="pixels of the camera from one point to the next")] = _STEP,
+) -> Response:
+    """Watch live depth. Who reads slowly misses images, and always gets the newest one."""
+    held.enter_context(service.streams.take())
+    viewer = await run_in_threadpool(service.manager.live.watch, step)
+    return StreamingResponse(_messages(viewer), media_type=_TYPE, headers={"Cache-Control": "no-store"})
+
+
+async def _messages(viewer: Viewer) -> AsyncIterator[bytes]:
+    number = -1
+    with viewer:
+        while True:
+            try:
+                came = await run_in_threadpool(viewer.message, number, _LOOK_S)
+            except SlrigError as error:
+                yield message({"kind": "end", "code": error.code, "reason": str(error)}, b"")
+                return
+            if came is None:
+                # Whoever has gone is noticed by it.
+                yield message({"kind": "wait"}, b"")
+                continue
+            number, made = came
+            yield made
+
+
+def _body(status: LiveStatus) -> LiveBody:
+    return filled(LiveBody, status, camera=status.options.camera, links={"self": "/live", "depth": "/live/depth"})

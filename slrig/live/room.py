@@ -1,0 +1,283 @@
+"""Live depth of one rig: who watches, and the newest messages for them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import structlog
+
+from slrig.devices import CameraInfo, ProjectorInfo, Rig
+from slrig.errors import CalibrationError, LiveStateError, SlrigError, WorkerLostError
+from slrig.live.plan import live_plan
+from slrig.live.player import play
+from slrig.live.process import DepthCame, GeometryCame, LiveFailed, LiveProcess, LiveTask
+from slrig.model import Calibration, Shot, triangulated_axis
+
+UNWATCHED_S = 10.0
+"""Live depth that nobody watches ends after so long."""
+
+_MOST_POINTS = 1_500_000  # decoded by default
+_RATE_OF = 20  # depth images
+
+_log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class LiveOptions:
+    """What somebody asks for. step : pixels from one decoded ray to the next; None for all, of large cameras fewer.
+    exposure_s : None for that of the rig file.
+    """
+
+    camera: str
+    step: int | None = None
+    exposure_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LiveStatus:
+    """Live depth as it is. patterns : of one cycle. playing : False while a job holds the rig. depth_per_s : of late;
+    None before. facts : of the newest depth image, as `slrig.live.process.depth_facts` has them.
+    """
+
+    options: LiveOptions
+    step: int
+    patterns: int
+    viewers: int
+    playing: bool
+    depth_per_s: float | None
+    facts: dict[str, Any] | None
+
+
+class Viewer:
+    """Somebody who watches. Leave the `with` block to stop. step : pixels of the camera from point to point."""
+
+    def __init__(self, room: LiveRoom, session: _Session, step: int) -> None:
+        self.session, self.step = session, step
+        self._room = room
+
+    def message(self, after: int, timeout_s: float) -> tuple[int, bytes] | None:
+        """Return the newest message with a number above `after`, geometry being number 0, and that number; None when
+        none came in time. `after` : −1 for the first. Raises SlrigError: live depth is over.
+        """
+        return self._room.message(self, after, timeout_s)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._room.leave(self)
+
+
+class _Session:
+    """One live depth, from its start to its end."""
+
+    def __init__(self, options: LiveOptions, task: LiveTask) -> None:
+        self.options, self.task = options, task
+        self.process = LiveProcess(task)
+        self.viewers: list[Viewer] = []
+        self.unwatched_s: float | None = time.monotonic()
+        self.geometry: dict[int, bytes] = {}
+        self.newest: DepthCame | None = None
+        self.came_s: deque[float] = deque(maxlen=_RATE_OF)
+        self.error: SlrigError | None = None
+        self.playing = False
+
+    @property
+    def steps(self) -> tuple[int, ...]:
+        return tuple(sorted({viewer.step // self.task.step for viewer in self.viewers}))
+
+
+class LiveRoom:
+    """The live depth of a rig, if there is one. All but `run` may be called from any thread.
+
+    woken : called when live depth begins.
+    """
+
+    def __init__(self, woken: Callable[[], None]) -> None:
+        self._woken = woken
+        self._changed = threading.Condition()
+        self._session: _Session | None = None
+
+    @property
+    def wanted(self) -> bool:
+        """Whether live depth is to be played. Ends it where nobody has watched for `UNWATCHED_S`."""
+        with self._changed:
+            session = self._session
+            if session is None:
+                return False
+            unwatched_s = session.unwatched_s
+        if unwatched_s is None or time.monotonic() < unwatched_s + UNWATCHED_S:
+            return True
+        self._finish(session, LiveStateError(f"Nobody watched the live depth for {UNWATCHED_S:g} s, so it ended."))
+        return False
+
+    def start(
+        self, options: LiveOptions, camera: CameraInfo, projector: ProjectorInfo, calibration: Calibration | None
+    ) -> LiveStatus:
+        """Begin. Raises LiveStateError: there is one already. CalibrationError, PatternError: there can be none."""
+        if calibration is None or calibration.projector is None or options.camera not in calibration.cameras:
+            message = (
+                f"Live depth needs a calibration of projector and camera '{options.camera}', and the rig has none. "
+                "Calibrate it (POST /calibration), or look through the camera meanwhile (GET /preview/CAMERA)."
+            )
+            raise CalibrationError(message)
+        plan = live_plan(projector, triangulated_axis([calibration.cameras[options.camera]], calibration.projector))
+        step = options.step or _default_step(camera)
+        with self._changed:
+            if self._session is not None:
+                message = (
+                    f"Live depth of camera '{self._session.options.camera}' is under way: watch it (GET /live/depth), "
+                    "or end it first (DELETE /live)."
+                )
+                raise LiveStateError(message)
+            session = self._session = _Session(
+                options, LiveTask(plan, calibration, options.camera, camera.format, step)
+            )
+        threading.Thread(target=self._listen, args=(session,), name="slrig-live", daemon=True).start()
+        self._woken()
+        return self.status()
+
+    def end(self) -> None:
+        """End live depth. Returns at once; the projector is dark within the exposure under way. Idempotent."""
+        with self._changed:
+            session = self._session
+        if session is not None:
+            self._finish(session, LiveStateError("The live depth was ended."))
+
+    def fail(self, error: SlrigError) -> None:
+        """End live depth by a fault of the rig, or of the service."""
+        with self._changed:
+            session = self._session
+        if session is not None:
+            self._finish(session, error)
+
+    def status(self) -> LiveStatus:
+        """Return what there is. Raises LiveStateError: nothing."""
+        with self._changed:
+            session = self._require()
+            times = session.came_s
+            rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else None
+            if times and time.monotonic() - times[-1] > 2.0:
+                rate = 0.0
+            return LiveStatus(
+                session.options, session.task.step, len(session.task.plan.patterns), len(session.viewers),
+                session.playing, rate, None if session.newest is None else session.newest.facts,
+            )  # fmt: skip
+
+    def watch(self, step: int) -> Viewer:
+        """Begin to watch every `step`-th pixel, or the next multiple that is decoded. Raises LiveStateError."""
+        with self._changed:
+            session = self._require()
+            own = session.task.step
+            viewer = Viewer(self, session, own * max(1, -(-step // own)))
+            session.viewers.append(viewer)
+            session.unwatched_s = None
+            steps = session.steps
+        session.process.want(steps)
+        return viewer
+
+    def leave(self, viewer: Viewer) -> None:
+        """Stop watching. Idempotent."""
+        session = viewer.session
+        with self._changed:
+            session.viewers = [each for each in session.viewers if each is not viewer]
+            if not session.viewers and session.unwatched_s is None:
+                session.unwatched_s = time.monotonic()
+            steps = session.steps
+        session.process.want(steps)
+
+    def message(self, viewer: Viewer, after: int, timeout_s: float) -> tuple[int, bytes] | None:
+        """See `Viewer.message`."""
+        session, step = viewer.session, viewer.step // viewer.session.task.step
+
+        def found() -> tuple[int, bytes] | None:
+            newest = session.newest
+            if after < 0:
+                return (0, session.geometry[step]) if step in session.geometry else None
+            if newest is not None and newest.number > after and step in newest.messages:
+                return newest.number, newest.messages[step]
+            return None
+
+        with self._changed:
+            self._changed.wait_for(lambda: session.error is not None or found() is not None, timeout_s)
+            if session.error is not None:
+                raise session.error
+            return found()
+
+    def run(self, rig: Rig, calibration: Calibration | None, stop: Callable[[], bool]) -> None:
+        """Play until live depth ends or `stop` says so. For the thread that owns the rig. Raises what devices raise.
+
+        calibration : in use now. Live depth by another one ends.
+        """
+        with self._changed:
+            session = self._session
+            if session is None:
+                return
+            session.playing = True
+        if calibration is None or calibration.digest != session.task.calibration.digest:
+            self._finish(
+                session, LiveStateError("Another calibration came into use. Start live depth again (POST /live).")
+            )
+        process, options = session.process, session.options
+
+        def take(pattern: int, shot: Shot, begin_s: float, end_s: float) -> None:
+            process.put(pattern, shot.image, begin_s, end_s)
+
+        def over() -> bool:
+            return stop() or session.error is not None or not self.wanted
+
+        try:
+            play(rig, session.task.plan, options.camera, take, over, exposure_s=options.exposure_s)
+        finally:
+            with self._changed:
+                session.playing = False
+
+    def _require(self) -> _Session:
+        if self._session is None:
+            message = "There is no live depth. Begin one with POST /live."
+            raise LiveStateError(message)
+        return self._session
+
+    def _listen(self, session: _Session) -> None:
+        """Take what the process says, on a thread of its own, so that it never waits."""
+        cause = "its process ended"
+        while True:
+            try:
+                came = session.process.messages.recv()
+            except (EOFError, OSError):
+                break
+            with self._changed:
+                if isinstance(came, GeometryCame):
+                    session.geometry.update(came.messages)
+                elif isinstance(came, DepthCame):
+                    session.newest = came
+                    session.came_s.append(time.monotonic())
+                elif isinstance(came, LiveFailed):
+                    cause = came.cause.strip().splitlines()[-1]
+                    _log.error("live depth failed", trace=came.cause)
+                self._changed.notify_all()
+        self._finish(session, WorkerLostError(f"The live depth ended: {cause}. Start it again (POST /live)."))
+
+    def _finish(self, session: _Session, error: SlrigError) -> None:
+        with self._changed:
+            if session.error is None:
+                session.error = error
+            if self._session is session:
+                self._session = None
+            self._changed.notify_all()
+        session.process.close()
+
+
+def _default_step(camera: CameraInfo) -> int:
+    size, step = camera.format.size, 1
+    while size.width_px * size.height_px / step**2 > _MOST_POINTS:
+        step += 1
+    return step
