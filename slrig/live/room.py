@@ -82,8 +82,8 @@ class _Session:
     def __init__(self, options: LiveOptions, task: LiveTask) -> None:
         self.options, self.task = options, task
         self.process = LiveProcess(task)
+        # Replaced, never changed: the rig's thread looks at it without the lock.
         self.viewers: list[Viewer] = []
-        self.unwatched_s: float | None = time.monotonic()
         self.geometry: dict[int, bytes] = {}
         self.newest: DepthCame | None = None
         self.came_s: deque[float] = deque(maxlen=_RATE_OF)
@@ -98,31 +98,28 @@ class _Session:
 class LiveRoom:
     """The live depth of a rig, if there is one. All but `run` may be called from any thread.
 
-    woken : called when live depth begins.
+    It is played while somebody watches: the projector is dark as soon as the last one leaves. woken : called when
+    somebody begins to.
     """
 
     def __init__(self, woken: Callable[[], None]) -> None:
         self._woken = woken
-        self._changed = threading.Condition()
+        self._changed = threading.Condition(threading.RLock())
         self._session: _Session | None = None
 
     @property
     def wanted(self) -> bool:
-        """Whether live depth is to be played. Ends it where nobody has watched for `UNWATCHED_S`."""
-        with self._changed:
-            session = self._session
-            if session is None:
-                return False
-            unwatched_s = session.unwatched_s
-        if unwatched_s is None or time.monotonic() < unwatched_s + UNWATCHED_S:
-            return True
-        self._finish(session, LiveStateError(f"Nobody watched the live depth for {UNWATCHED_S:g} s, so it ended."))
-        return False
+        """Whether somebody watches, so that it is to be played."""
+        session = self._session
+        return session is not None and bool(session.viewers)
 
     def start(
         self, options: LiveOptions, camera: CameraInfo, projector: ProjectorInfo, calibration: Calibration | None
     ) -> LiveStatus:
-        """Begin. Raises LiveStateError: there is one already. CalibrationError, PatternError: there can be none."""
+        """Begin, or go on with one by the same options; another one that nobody watches is replaced.
+
+        Raises LiveStateError: somebody watches another one. CalibrationError, PatternError: there can be none.
+        """
         if calibration is None or calibration.projector is None or options.camera not in calibration.cameras:
             message = (
                 f"Live depth needs a calibration of projector and camera '{options.camera}', and the rig has none. "
@@ -131,22 +128,26 @@ class LiveRoom:
             raise CalibrationError(message)
         plan = live_plan(projector, triangulated_axis([calibration.cameras[options.camera]], calibration.projector))
         step = options.step or _default_step(camera)
+        task = LiveTask(plan, calibration, options.camera, camera.format, step)
         with self._changed:
-            if self._session is not None:
+            other = self._session
+            if other is not None and other.options == options and other.task.calibration.digest == calibration.digest:
+                return self.status()
+            if other is not None and other.viewers:
                 message = (
-                    f"Live depth of camera '{self._session.options.camera}' is under way: watch it (GET /live/depth), "
-                    "or end it first (DELETE /live)."
+                    f"Somebody watches live depth of camera '{other.options.camera}' with other options: watch that "
+                    "(GET /live/depth), or end it first (DELETE /live)."
                 )
                 raise LiveStateError(message)
-            session = self._session = _Session(
-                options, LiveTask(plan, calibration, options.camera, camera.format, step)
-            )
+            session = self._session = _Session(options, task)
+        if other is not None:
+            self._finish(other, LiveStateError("Live depth was started with other options."))
         threading.Thread(target=self._listen, args=(session,), name="slrig-live", daemon=True).start()
-        self._woken()
+        self._end_unless_watched(session)
         return self.status()
 
     def end(self) -> None:
-        """End live depth. Returns at once; the projector is dark within the exposure under way. Idempotent."""
+        """End live depth. Returns at once; the projector is dark when the exposure under way is over. Idempotent."""
         with self._changed:
             session = self._session
         if session is not None:
@@ -178,10 +179,10 @@ class LiveRoom:
             session = self._require()
             own = session.task.step
             viewer = Viewer(self, session, own * max(1, -(-step // own)))
-            session.viewers.append(viewer)
-            session.unwatched_s = None
+            session.viewers = [*session.viewers, viewer]
             steps = session.steps
         session.process.want(steps)
+        self._woken()
         return viewer
 
     def leave(self, viewer: Viewer) -> None:
@@ -189,10 +190,10 @@ class LiveRoom:
         session = viewer.session
         with self._changed:
             session.viewers = [each for each in session.viewers if each is not viewer]
-            if not session.viewers and session.unwatched_s is None:
-                session.unwatched_s = time.monotonic()
             steps = session.steps
         session.process.want(steps)
+        if not steps:
+            self._end_unless_watched(session)
 
     def message(self, viewer: Viewer, after: int, timeout_s: float) -> tuple[int, bytes] | None:
         """See `Viewer.message`."""
@@ -239,6 +240,16 @@ class LiveRoom:
         finally:
             with self._changed:
                 session.playing = False
+
+    def _end_unless_watched(self, session: _Session) -> None:
+        def look() -> None:
+            if not session.viewers:
+                message = f"Nobody watched the live depth for {UNWATCHED_S:g} s, so it ended."
+                self._finish(session, LiveStateError(message))
+
+        timer = threading.Timer(UNWATCHED_S, look)
+        timer.daemon = True
+        timer.start()
 
     def _require(self) -> _Session:
         if self._session is None:

@@ -1,5 +1,6 @@
 // The live picture of a camera: there at once while somebody looks and the rig is free, with what it says of light and focus.
 import {html, useEffect, useRef, useState} from "./vendor/preact-htm.js";
+import {LiveDepth} from "./depth.js";
 import {Opening, holderWords} from "./ready.js";
 import {Choice} from "./ui.js";
 
@@ -38,6 +39,7 @@ function useLooking() {
 export function Live({rig, may, aim, ghost, plain = false, exposure_s = null, told}) {
   const [chosen, setChosen] = useState(() => sessionStorage.getItem(KEPT));
   const [light, setLight] = useState("white");
+  const [view, setView] = useState("picture");
   const [failed, setFailed] = useState(false);
   const running = useRef(null);
   const looking = useLooking();
@@ -54,6 +56,9 @@ export function Live({rig, may, aim, ghost, plain = false, exposure_s = null, to
     : camera === null ? "The live picture is off." : !looking ? "Paused, because nobody looks. Move the pointer to go on."
       : failed ? "No picture comes. It is tried again by itself." : rig.holder && running.current !== stream ? `${holderWords(rig)} The picture comes when it is free.` : null;
   const {size_px} = rig?.cameras.find((each) => each.name === camera) ?? {};
+  // Only where nothing else is aimed at: a board is placed by what the camera sees.
+  const offered = !plain && aim === undefined && rig?.calibrated;
+  const inDepth = offered && view === "depth" && camera && looking && rig.open && !rig.error;
   const aimed = !absent && aim?.camera === camera && aim?.outline_px?.length ? aim : null;
   const choose = (name) => {
     sessionStorage.setItem(KEPT, name);
@@ -61,14 +66,17 @@ export function Live({rig, may, aim, ghost, plain = false, exposure_s = null, to
     setFailed(false);
   };
   return html`
-    ${absent ? html`<div class="live none" role=${failed ? "alert" : null}>${absent}</div>`
+    ${inDepth ? html`<${LiveDepth} key=${camera} camera=${camera} size_px=${size_px} exposure_s=${exposure_s} />`
+      : absent ? html`<div class="live none" role=${failed ? "alert" : null}>${absent}</div>`
       : html`<div class="aimed"><${Picture} key=${stream} stream=${stream} camera=${camera} running=${running} told=${told} failed=${() => setFailed(true)} />
         ${ghost?.[camera] && html`<img class="ghost" src=${ghost[camera]} alt="The last view, half-transparent" />`}
         ${aimed && html`<${Aim} aim=${aimed} size_px=${size_px} />`}</div>`}
     <div class="row">
       ${names.length > 0 && html`<${Choice} label="Camera" value=${camera ?? OFF} options=${[...names.map((name) => [name, name]), [OFF, "Off"]]} chosen=${choose} />`}
-      ${camera && !absent && html`<${Choice} label="Projector" value=${light} options=${[["white", "White light"], ["off", "Dark"]]} chosen=${setLight} />`}
-      ${!absent && html`<span class="legend">${aimed && html`<span><span class="swatch aim"></span> The board goes here, its upper left corner to the dot.</span>`}
+      ${offered && camera && html`<${Choice} label="View" value=${view} options=${[["picture", "Picture"], ["depth", "Depth"]]} chosen=${setView} />`}
+      ${camera && !absent && !inDepth && html`<${Choice} label="Projector" value=${light} options=${[["white", "White light"], ["off", "Dark"]]} chosen=${setLight} />`}
+      ${inDepth && html`<span class="legend"><span><span class="swatch moved"></span> moved</span><span><span class="swatch saturated"></span> saturated</span><span>black: dark or unseen</span></span>`}
+      ${!absent && !inDepth && html`<span class="legend">${aimed && html`<span><span class="swatch aim"></span> The board goes here, its upper left corner to the dot.</span>`}
         ${!plain && html`<span><span class="swatch saturated"></span> saturated</span>`}${!plain && light === "white" && html`<span><span class="swatch dark"></span> too dark</span>`}${rig.holder && html`<span>Waits while the rig is in use.</span>`}</span>`}
     </div>`;
 }

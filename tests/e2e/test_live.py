@@ -32,8 +32,12 @@ def test_live_depth_is_seen_by_many_gives_way_to_a_scan_and_ends(
         while not client.get("/rig")["open"]:
             threading.Event().wait(0.1)
         client.live.start()
-        with pytest.raises(ServiceError, match="is under way"):
-            client.live.start()
+        assert client.live.start()["viewers"] == 0
+        watching = client.live.watch(step=2)
+        next(watching)
+        with pytest.raises(ServiceError, match="with other options"):
+            client.live.start(step=2)
+        del watching
         (frame,) = _first(client)
         assert np.mean(frame.state == 0) > 0.5
         # The plate turns by 8 and 12 degrees about the axes of a camera 15 degrees aside.

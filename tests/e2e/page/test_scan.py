@@ -40,6 +40,14 @@ def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit:
     page.get_by_text("% saturated").wait_for()
     page.get_by_role("button", name="Scan", exact=True).and_(page.locator(":enabled")).wait_for()
     looks_as_kept(page, "scan")
+    # The shape while somebody aims.
+    page.get_by_role("button", name="Depth", exact=True).click()
+    page.get_by_text("% measured").wait_for()
+    assert violations(page) == []
+    data = "canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data"
+    drawn = f"canvas => {data}.filter((each) => each > 180).length"
+    assert page.get_by_role("img", name="Depth in colours").evaluate(drawn) > 10_000
+    page.get_by_role("button", name="Picture", exact=True).click()
     page.get_by_role("button", name="As the rig is set").click()
     page.get_by_role("button", name="Off").click()
 
