@@ -208,7 +208,8 @@ class LiveDecoder:
             return cause
         self._refused_in_a_row[pattern] = 0
         plan = self.plan
-        angle = 0.0 if pattern in plan.bits else plan.angle(pattern)
+        summed = pattern in plan.fine or pattern in plan.coarse
+        angle = plan.angle(pattern) if summed else 0.0
         sums = (self._coarse_real, self._coarse_imaginary) if pattern in plan.coarse else (self._real, self._imaginary)
         weights = (
             (1.0, math.cos(angle), math.sin(angle)) if pattern in plan.fine else (0.0, math.cos(angle), math.sin(angle))
@@ -217,7 +218,7 @@ class LiveDecoder:
             _take_kernel, len(lattice), np.ascontiguousarray(lattice), self._frames[pattern], self._changes[pattern],
             self._changed, self._clipped, *(np.float32(each) for each in self._noise or (self._spatial, 0.0)),
             np.float32(self._clipped_at),
-            pattern not in plan.bits, *(np.float32(each) for each in weights), self._total, *sums,
+            summed, *(np.float32(each) for each in weights), self._total, *sums,
         )  # fmt: skip
         self._times[pattern] = begin_s, end_s
         self._seen[pattern] += 1
@@ -239,10 +240,12 @@ class LiveDecoder:
         read, slope = (np.float32(each) for each in self._noise)
         code = plan.patterns[plan.bits[0]] if plan.bits else None
         if isinstance(code, Gray):
-            bits = self._frames[list(plan.bits)]
+            level, share = self._total, 1 / len(plan.fine)
+            if plan.levels:
+                level, share = self._frames[list(plan.levels)].sum(axis=0, dtype=np.float32), 0.5
             in_bands(
-                _code_kernel, shape[0], bits, self._total, np.float32(1 / len(plan.fine)), np.float32(code.cell_px),
-                np.float32((code.cell_px - 1) / 2 - code.offset_px), rough, uncertain,
+                _code_kernel, shape[0], self._frames[list(plan.bits)], level, np.float32(share),
+                np.float32(code.cell_px), np.float32((code.cell_px - 1) / 2 - code.offset_px), rough, uncertain,
             )  # fmt: skip
         else:
             per_turn, steps = np.float32(plan.coarse_px), np.float32(len(plan.coarse))
@@ -487,12 +490,12 @@ def _angle(y: Any, x: Any) -> Any:
 
 @kernel(in_every_scan=False)
 def _code_kernel(
-    first: int, last: int, bits: Any, total: Any, share: Any, cell_px: Any, offset_px: Any, rough: Any, uncertain: Any
+    first: int, last: int, bits: Any, level: Any, share: Any, cell_px: Any, offset_px: Any, rough: Any, uncertain: Any
 ) -> None:
-    """Fill in the middle of the Gray cell of each pixel; a bit is lit if its frame is brighter than the fine ones."""
+    """Fill in the middle of the Gray cell of each pixel; a bit is lit if it is brighter than a share of `level`."""
     for y in range(first, last):
         for x in range(rough.shape[1]):
-            mean = total[y, x] * share
+            mean = level[y, x] * share
             cell, lit = 0, 0
             for k in range(len(bits)):
                 lit ^= 1 if np.float32(bits[k, y, x]) > mean else 0

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from slrig.devices import ProjectorInfo
 from slrig.errors import PatternError
-from slrig.model import Axis, Gray, LineShift, Pattern, Sine, Size, has_even_shifts
+from slrig.model import Axis, Black, Gray, LineShift, Pattern, Sine, Size, White, has_even_shifts
 
 STEPS = 4
 """Shifts of a sinusoid. Three would do in a linear world; with four the second harmonic, which the projector's gamma
@@ -28,7 +28,8 @@ _CELL_PX = 6
 @dataclass(frozen=True, slots=True)
 class LivePlan:
     """Patterns of one cycle, in the order of play. fine, coarse, bits : their indices; the periods of the fine ones are
-    numbered by a coarse sinusoid or by the bits of a Gray code.
+    numbered by a coarse sinusoid or by the bits of a Gray code. levels : white and black, between which a bit is lit;
+    empty where the mean of the fine patterns is half-way.
     """
 
     axis: Axis
@@ -36,6 +37,7 @@ class LivePlan:
     fine: tuple[int, ...]
     coarse: tuple[int, ...] = ()
     bits: tuple[int, ...] = ()
+    levels: tuple[int, ...] = ()
 
     @property
     def fine_px(self) -> float:
@@ -95,7 +97,7 @@ def _recorded_plan(projector: ProjectorInfo, axis: Axis) -> LivePlan:
     for pattern in dict.fromkeys(projector.recorded):
         if isinstance(pattern, Sine) and pattern.axis is axis:
             sines[pattern.period_px].append(pattern)
-        elif isinstance(pattern, LineShift) and pattern.axis is axis and pattern.is_half_lit:
+        elif isinstance(pattern, LineShift) and pattern.axis is axis:
             lines[pattern.period_px, pattern.line_width_px].append(pattern)
         elif isinstance(pattern, Gray) and pattern.axis is axis and not pattern.inverted:
             code[pattern.bits, pattern.cell_px, pattern.offset_px].append(pattern)
@@ -104,12 +106,18 @@ def _recorded_plan(projector: ProjectorInfo, axis: Axis) -> LivePlan:
     even = [group for each in lines.values() if has_even_shifts(group := sorted(each, key=lambda line: line.shift))]
     codes = [sorted(each, key=lambda gray: gray.bit) for key, each in code.items() if len(each) == key[0]]
     fine: Sequence[Sine | LineShift] = whole[0] if whole else min(even, key=lambda each: each[0].period_px, default=())
+    references: list[Pattern] = [pattern for pattern in (White(), Black()) if pattern in projector.recorded]
     if fine:
         period_px = fine[0].period_px
+        narrow = isinstance(fine[0], LineShift) and not fine[0].is_half_lit
         for bits in codes:
-            if 2 * bits[0].cell_px <= period_px:
-                count = len(fine)
-                return LivePlan(axis, (*fine, *bits), tuple(range(count)), bits=tuple(range(count, count + len(bits))))
+            if 2 * bits[0].cell_px <= period_px and (not narrow or len(references) == 2):
+                levels = references if narrow else []
+                count, end = len(fine), len(fine) + len(bits)
+                return LivePlan(
+                    axis, (*fine, *bits, *levels), tuple(range(count)), bits=tuple(range(count, end)),
+                    levels=tuple(range(end, end + len(levels))),
+                )  # fmt: skip
         if whole and whole[-1][0].period_px >= projector.size.along(axis):
             count, both = len(fine), (*fine, *whole[-1])
             return LivePlan(axis, both, tuple(range(count)), tuple(range(count, len(both))))

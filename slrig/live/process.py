@@ -28,7 +28,8 @@ from slrig.model import Calibration, CameraFormat, Pixels
 _SERVER = "slrig.live.server"
 
 PLACES = 8
-"""Frames that shared memory holds: those of the last tenths of a second. Later ones replace the earliest."""
+"""Frames that shared memory holds: those of the last tenths of a second. Later ones replace the earliest. After the
+number of the frame in each place comes that of the last frame that was taken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +91,7 @@ class LiveProcess:
         sample = np.dtype(np.uint8 if task.format.full_scale <= 255 else np.uint16)
         shape = (PLACES, *task.format.size.shape)
         self._memory = RawArray("B", int(np.prod(shape)) * sample.itemsize)
-        self._numbers = RawArray("q", PLACES)
+        self._numbers = RawArray("q", PLACES + 1)
         self._frames: NDArray[Any] = np.frombuffer(self._memory, sample).reshape(shape)
         self.messages, far = spawning.Pipe()
         self._sending = threading.Lock()
@@ -100,6 +101,11 @@ class LiveProcess:
         )
         self._process.start()
         far.close()
+
+    @property
+    def behind(self) -> int:
+        """How many of the frames that were handed over have not been looked at."""
+        return self._number - int(self._numbers[PLACES])
 
     def put(self, pattern: int, image: Pixels, begin_s: float, end_s: float) -> None:
         """Hand over a frame. Returns at once."""

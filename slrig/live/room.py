@@ -24,6 +24,7 @@ UNWATCHED_S = 10.0
 
 _MOST_POINTS = 1_500_000  # decoded by default
 _RATE_OF = 20  # depth images
+_COMPUTED_PER_S, _GLANCE_S = 25.0, 0.004
 
 _log = structlog.get_logger(__name__)
 
@@ -229,8 +230,16 @@ class LiveRoom:
             )
         process, options = session.process, session.options
 
+        computed = rig.cameras[options.camera].info.limits.computed
+        next_s = 0.0
+
         def take(pattern: int, shot: Shot, begin_s: float, end_s: float) -> None:
+            nonlocal next_s
             process.put(pattern, shot.image, begin_s, end_s)
+            # Time of rendered and replayed devices passes as fast as they compute.
+            while computed and not over() and (process.behind > 1 or time.monotonic() < next_s):
+                time.sleep(_GLANCE_S)
+            next_s = max(next_s + 1 / _COMPUTED_PER_S, time.monotonic())
 
         def over() -> bool:
             return stop() or session.error is not None or not self.wanted

@@ -72,7 +72,7 @@ class LiveServer:
             return False
         if not isinstance(message, FrameCame):
             return False
-        place = message.number % PLACES
+        place, self._numbers[PLACES] = message.number % PLACES, message.number
         if self._numbers[place] != message.number:
             self._lost += 1
             return False

@@ -10,7 +10,7 @@ import pytest
 from slrig.devices import ProjectorInfo
 from slrig.live.depth import DepthImage, LiveDecoder, PixelState
 from slrig.live.plan import LivePlan, live_plan
-from slrig.model import Axis, Gray, LineShift
+from slrig.model import Axis, Black, Gray, LineShift, White
 from tests.unit.live.scene import EXPOSURE_S, FRAME_S, PROJECTOR, Photographer, Plane, bound_mm, calibration
 
 _MEASURED, _MOVED = PixelState.MEASURED, PixelState.MOVED
@@ -118,6 +118,7 @@ def test_frames_of_another_pattern_make_no_wrong_depth(
 def test_a_black_and_white_projector_plays_lines_and_a_code_and_a_recording_what_it_has() -> None:
     lines = _plan(shades=False)
     assert {type(pattern) for pattern in lines.patterns} == {LineShift, Gray}
-    recorded = ProjectorInfo("p", "p", "1", PROJECTOR, False, 0.0, recorded=lines.patterns[::-1])
+    recorded = ProjectorInfo("p", "p", "1", PROJECTOR, False, 0.0, recorded=(*lines.patterns[::-1], White(), Black()))
+    assert set(live_plan(recorded, Axis.COLUMN).patterns) > set(lines.patterns)
     with pytest.raises(Exception, match="recording of 'p' has none"):
         live_plan(recorded, Axis.ROW)
