@@ -23,7 +23,10 @@ from tests.postgres import Postgres
 ROOT = Path(__file__).resolve().parents[1]
 
 _OF_A_SHELL = ("NUMBA_", "SLRIG_", "XDG_")
-_KEPT = {"SLRIG_SHARED", "SLRIG_GOLDEN", "SLRIG_FUZZ_FILES", "SLRIG_FUZZ_KILLS", "SLRIG_FUZZ_SEED", "SLRIG_TEST_CACHE"}
+_KEPT = {
+    "SLRIG_SHARED", "SLRIG_GOLDEN", "SLRIG_FUZZ_FILES", "SLRIG_FUZZ_KILLS", "SLRIG_FUZZ_SEED", "SLRIG_ROS_PYTHON",
+    "SLRIG_TEST_CACHE",
+}  # fmt: skip
 """Variables for tests."""
 
 NEED_KERNELS = (

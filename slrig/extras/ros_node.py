@@ -1,7 +1,8 @@
-"""A ROS 2 node that scans when its service is called, and publishes the result.
+"""A ROS 2 node that scans for an action or a service, and publishes the result.
 
-`python -m slrig.extras.ros_node --ros-args -p url:=http://scanner:8731` where ROS is set up. All types are ROS's own:
-an action for scans would need a package of interfaces that is built first.
+`python -m slrig.extras.ros_node --ros-args -p url:=http://scanner:8731` where ROS is set up. No action among ROS's own
+has the goal, feedback and result of a scan, so `~/scan` is a `slrig_interfaces/action/Scan` where the package beside
+this file was built. As a `std_srvs/srv/Trigger`, which has neither progress nor cancel, `~/scan` needs no build.
 """
 
 from __future__ import annotations
@@ -9,41 +10,145 @@ from __future__ import annotations
 import array
 import importlib
 import json
-from collections.abc import Mapping, Sequence
+import signal
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import datetime
+from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.client import Client, ScanResult
-from slrig.errors import SlrigError
+from slrig.client import Captured, Client, Progress, ScanJob, ScanResult, StateChange
+from slrig.errors import ExtraMissingError, ScanCancelledError, SlrigError
 from slrig.ros_messages import PROJECTOR, TF_STATIC, WORLD, Device, Messages, topic
 
 NODE = "slrig"
+_THREADS = 32
+"""More than scans that wait in the service's line (`queue_length`, 16), so that none keeps another callback waiting."""
+_LOOK_S = 0.1
+"""How often goals are looked at: rclpy notes that one is to be cancelled only after it has asked whether it may be."""
+_ADVICE = {
+    "rig-busy": " A goal with queue: true waits.",
+    "service": " To this node an address is given by -p url:=http://HOST:8731.",
+}
+"""What is added to an error where a person has this node before them. By its code."""
 
 
 class ScanNode:
-    """What the node does. node : rclpy's, whose service and publishers these are. world : the frame of the points."""
+    """What the node does. node : rclpy's, which offers it. world : the frame of the points.
+
+    Raises
+    ------
+    ExtraMissingError
+        One of ROS's packages of messages is missing.
+    """
 
     def __init__(self, node: Any, client: Client, *, world: str = WORLD) -> None:
+        from rclpy.action import ActionServer, CancelResponse
+        from rclpy.callback_groups import ReentrantCallbackGroup
+        from rclpy.task import Future
+
         self._node = node
         self._client = client
         self._world = world
         self._publishers: dict[str, Any] = {}
-        node.create_service(_class_of("std_srvs/srv/Trigger"), "~/scan", self.scan)
+        self._jobs: dict[ScanJob, Callable[[], bool]] = {}
+        self._cancelled: set[ScanJob] = set()
+        self._publishing = Lock()
+        self._stopping = False
+        self.stopped = Future()
+        for kind in ("sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage"):
+            _class_of(kind)
+        beside = ReentrantCallbackGroup()
+        node.create_service(_class_of("std_srvs/srv/Trigger"), "~/scan", self.answer, callback_group=beside)
+        node.create_timer(_LOOK_S, self._look, callback_group=beside)
+        try:
+            self._action = _class_of("slrig_interfaces/action/Scan")
+        except ExtraMissingError as error:
+            node.get_logger().warning(f"Scans are without progress and cancel, by a service: {error}")
+            return
+        accept = CancelResponse.ACCEPT
+        ActionServer(
+            node, self._action, "~/scan", self.execute, callback_group=beside, cancel_callback=lambda _: accept
+        )
 
-    def scan(self, _request: Any, response: Any) -> Any:
+    def answer(self, _request: Any, response: Any) -> Any:
         """Scan, publish, and answer with the scan's id, or with what went wrong. Waits while the rig is held."""
         try:
-            result = self._client.scan()
-            self.publish(result)
+            job = self._client.start_scan()
+            with self._followed(job, lambda: False):
+                self.publish(job.result())
         except SlrigError as error:
-            self._node.get_logger().error(str(error))
-            response.success, response.message = False, str(error)
+            response.success, response.message = False, self._fault(error)
         else:
-            response.success, response.message = True, result.id
+            response.success, response.message = True, job.id
         return response
+
+    def execute(self, goal: Any) -> Any:
+        """Scan as a goal says, tell how far it is, publish, and return the action's result."""
+        asked, result, told = goal.request, self._action.Result(), self._action.Feedback()
+        try:
+            job = self._client.start_scan(
+                label=asked.label or None, preset=asked.preset or None, if_busy="queue" if asked.queue else "reject"
+            )
+            result.scan_id = job.id
+            with self._followed(job, lambda: goal.is_cancel_requested):
+                for event in job:
+                    if isinstance(event, Progress):
+                        told.stage, told.fraction = event.stage, event.fraction
+                    elif isinstance(event, StateChange):
+                        told.stage = event.state
+                    told.rig_free |= isinstance(event, Captured)
+                    goal.publish_feedback(told)
+                self.publish(job.result())
+        except SlrigError as error:
+            result.code, result.message = error.code, self._fault(error)
+            if isinstance(error, ScanCancelledError) and goal.is_cancel_requested:
+                goal.canceled()
+            else:
+                goal.abort()
+        else:
+            goal.succeed()
+        return result
+
+    @contextmanager
+    def _followed(self, job: ScanJob, is_unwanted: Callable[[], bool]) -> Iterator[None]:
+        self._jobs[job] = is_unwanted
+        try:
+            yield
+        except ScanCancelledError as error:
+            if job not in self._cancelled:
+                raise
+            message = f"Scan {job.id} was cancelled by this node, because its goal was or because the node ends."
+            raise ScanCancelledError(message) from error
+        finally:
+            self._jobs.pop(job)
+            self._cancelled.discard(job)
+
+    def stop(self) -> None:
+        """Cancel all scans. `stopped` is done when they have ended."""
+        self._stopping = True
+
+    def _look(self) -> None:
+        for job, is_unwanted in list(self._jobs.items()):
+            if (self._stopping or is_unwanted()) and job not in self._cancelled:
+                self._cancelled.add(job)
+                try:
+                    job.cancel()
+                except SlrigError as error:
+                    self._fault(error)
+        if self._stopping and not self._jobs:
+            self.stopped.set_result(None)
+
+    def _fault(self, error: SlrigError) -> str:
+        """What is said of an error here."""
+        message = f"{error}{_ADVICE.get(error.code, '')}"
+        self._node.get_logger().error(message)
+        return message
 
     def publish(self, result: ScanResult) -> None:
         """Publish where the devices stand, how each sees, and the points of each camera, stamped with the time at which
@@ -52,11 +157,12 @@ class ScanNode:
         devices = _devices(json.loads(self._client.scans.file(result.id, "calibration.json")))
         seconds = datetime.fromisoformat(result.scan["started_at"]).timestamp()
         messages = Messages(class_of=_class_of, sequence=_sequence, seconds=seconds, world=self._world)
-        self._send(TF_STATIC, messages.transforms(devices))
-        for name, device in devices.items():
-            self._send(topic(name, "camera_info", under="~"), messages.camera_info(name, device))
-            if f"points-{name}.npz" in result.files:
-                self._send(topic(name, "points", under="~"), messages.points(result.cloud(name)))
+        with self._publishing:
+            self._send(TF_STATIC, messages.transforms(devices))
+            for name, device in devices.items():
+                self._send(topic(name, "camera_info", under="~"), messages.camera_info(name, device))
+                if f"points-{name}.npz" in result.files:
+                    self._send(topic(name, "points", under="~"), messages.points(result.cloud(name)))
 
     def _send(self, where: str, message: Any) -> None:
         if where not in self._publishers:
@@ -84,7 +190,13 @@ def _devices(calibration: Mapping[str, Any]) -> dict[str, Device]:
 
 def _class_of(kind: str) -> Any:
     package, sort, name = kind.split("/")
-    return getattr(importlib.import_module(f"{package}.{sort}"), name)
+    try:
+        return getattr(importlib.import_module(f"{package}.{sort}"), name)
+    except ModuleNotFoundError as cause:
+        folder = Path(__file__).parent / package
+        from_ros = f"apt install ros-$ROS_DISTRO-{package.replace('_', '-')}"
+        message = f"{package} is missing: {f'colcon build --paths {folder}' if folder.is_dir() else from_ros}"
+        raise ExtraMissingError(message) from cause
 
 
 def _sequence(numbers: NDArray[Any]) -> array.array[Any]:
@@ -94,25 +206,46 @@ def _sequence(numbers: NDArray[Any]) -> array.array[Any]:
     return found
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the node until ROS is shut down. The key is in SLRIG_API_KEY: everybody may read a node's parameters."""
-    import rclpy
-    from rclpy.executors import ExternalShutdownException
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the node until SIGINT or SIGTERM. The key is in SLRIG_API_KEY: everybody may read a node's parameters."""
+    try:
+        import rclpy
+    except ModuleNotFoundError:
+        sys.exit(
+            "rclpy is missing: the node runs in ROS 2. Run 'source /opt/ros/jazzy/setup.bash' first, and the node with "
+            "the Python of that ROS."
+        )
+    from rclpy.executors import MultiThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions
 
-    rclpy.init(args=arguments)
+    # With rclpy's own, a goal that is under way could not be told its end.
+    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(NODE)
+    executor = MultiThreadedExecutor(_THREADS)
+    executor.add_node(node)
     try:
         url = node.declare_parameter("url", "").value
         world = node.declare_parameter("world", WORLD).value
         with Client(url or None) as client:
-            ScanNode(node, client, world=world)
-            rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+            scans = ScanNode(node, client, world=world)
+
+            def stop(number: int, _frame: object) -> None:
+                # Once more ends it at once.
+                signal.signal(number, signal.SIG_DFL)
+                scans.stop()
+
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, stop)
+            executor.spin_until_future_complete(scans.stopped)
+    except SlrigError as error:
+        node.get_logger().fatal(str(error))
+        return 1
     finally:
+        executor.shutdown()
         node.destroy_node()
         rclpy.try_shutdown()
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
