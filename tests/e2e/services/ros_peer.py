@@ -20,7 +20,7 @@ from rclpy.serialization import serialize_message
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _FOUND_S = 30.0
-_LIMIT_S = 180
+_LIMIT_S = 300
 
 
 def fields(message: Any) -> dict[str, Any]:
