@@ -14,6 +14,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from threading import Lock
@@ -38,6 +39,15 @@ _ADVICE = {
 """What is added to an error where a person has this node before them. By its code."""
 
 
+@dataclass(eq=False, slots=True)
+class _Run:
+    """A scan that somebody waits for. is_unwanted : whether nobody does any more. job : None until it was begun."""
+
+    is_unwanted: Callable[[], bool]
+    job: ScanJob | None = None
+    is_cancelled: bool = False
+
+
 class ScanNode:
     """What the node does. node : rclpy's, which offers it. world : the frame of the points.
 
@@ -56,8 +66,7 @@ class ScanNode:
         self._client = client
         self._world = world
         self._publishers: dict[str, Any] = {}
-        self._jobs: dict[ScanJob, Callable[[], bool]] = {}
-        self._cancelled: set[ScanJob] = set()
+        self._runs: set[_Run] = set()
         self._publishing = Lock()
         self._stopping = False
         self.stopped = Future()
@@ -79,8 +88,7 @@ class ScanNode:
     def answer(self, _request: Any, response: Any) -> Any:
         """Scan, publish, and answer with the scan's id, or with what went wrong. Waits while the rig is held."""
         try:
-            job = self._client.start_scan()
-            with self._followed(job, lambda: False):
+            with self._scan(lambda: False) as job:
                 self.publish(job.result())
         except SlrigError as error:
             response.success, response.message = False, self._fault(error)
@@ -92,11 +100,10 @@ class ScanNode:
         """Scan as a goal says, tell how far it is, publish, and return the action's result."""
         asked, result, told = goal.request, self._action.Result(), self._action.Feedback()
         try:
-            job = self._client.start_scan(
-                label=asked.label or None, preset=asked.preset or None, if_busy="queue" if asked.queue else "reject"
-            )
-            result.scan_id = job.id
-            with self._followed(job, lambda: goal.is_cancel_requested):
+            names = {"label": asked.label or None, "preset": asked.preset or None}
+            busy = "queue" if asked.queue else "reject"
+            with self._scan(lambda: goal.is_cancel_requested, if_busy=busy, **names) as job:
+                result.scan_id = job.id
                 for event in job:
                     if isinstance(event, Progress):
                         told.stage, told.fraction = event.stage, event.fraction
@@ -116,32 +123,33 @@ class ScanNode:
         return result
 
     @contextmanager
-    def _followed(self, job: ScanJob, is_unwanted: Callable[[], bool]) -> Iterator[None]:
-        self._jobs[job] = is_unwanted
+    def _scan(self, is_unwanted: Callable[[], bool], **options: Any) -> Iterator[ScanJob]:
+        run = _Run(is_unwanted)
+        self._runs.add(run)
         try:
-            yield
+            run.job = self._client.start_scan(**options)
+            yield run.job
         except ScanCancelledError as error:
-            if job not in self._cancelled:
+            if run.job is None or not run.is_cancelled:
                 raise
-            message = f"Scan {job.id} was cancelled by this node, because its goal was or because the node ends."
+            message = f"Scan {run.job.id} was cancelled by this node, because its goal was or because the node ends."
             raise ScanCancelledError(message) from error
         finally:
-            self._jobs.pop(job)
-            self._cancelled.discard(job)
+            self._runs.discard(run)
 
     def stop(self) -> None:
         """Cancel all scans. `stopped` is done when they have ended."""
         self._stopping = True
 
     def _look(self) -> None:
-        for job, is_unwanted in list(self._jobs.items()):
-            if (self._stopping or is_unwanted()) and job not in self._cancelled:
-                self._cancelled.add(job)
+        for run in list(self._runs):
+            if run.job and not run.is_cancelled and (self._stopping or run.is_unwanted()):
+                run.is_cancelled = True
                 try:
-                    job.cancel()
+                    run.job.cancel()
                 except SlrigError as error:
                     self._fault(error)
-        if self._stopping and not self._jobs:
+        if self._stopping and not self._runs:
             self.stopped.set_result(None)
 
     def _fault(self, error: SlrigError) -> str:
