@@ -30,7 +30,7 @@ from slrig.ros_messages import PROJECTOR, TF_STATIC, WORLD, Device, Messages, to
 NODE = "slrig"
 _THREADS = 32
 """More than scans that wait in the service's line (`queue_length`, 16), so that none keeps another callback waiting."""
-_LOOK_S = 0.1
+_LOOK_S = 0.25
 """How often goals are looked at: rclpy notes that one is to be cancelled only after it has asked whether it may be."""
 _ADVICE = {
     "rig-busy": " A goal with queue: true waits.",
