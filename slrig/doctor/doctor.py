@@ -220,6 +220,7 @@ class _DoctorRun:
             ("flicker", self._measure_flicker),
             ("steadiness", self._check_steady),
             ("exposure", self._advise_exposures),
+            ("live depth", self._measure_live),
         ]
         if self.rig.projector.info.plays and all(
             Trigger.HARDWARE in camera.info.triggers for camera in self.rig.cameras.values()
@@ -389,6 +390,13 @@ class _DoctorRun:
                 reason = f"{advice.reason}; of {format_ms(advice.exposure_s)} the camera takes this"
                 advice = replace(advice, exposure_s=taken_s, reason=reason)
             self._advice[name] = advice
+
+    def _measure_live(self) -> None:
+        """Play live depth to each camera that takes real time."""
+        rig = self.rig if self.synchronisation is None else replace(self.rig, synchronisation=self.synchronisation)
+        for name, camera in rig.cameras.items():
+            if name in self._advice and not camera.info.limits.computed:
+                self.findings.append(timing.measure_live(rig, name, self._advice[name].exposure_s))
 
     def _measure_pulses(self) -> None:
         """Measure with the exposures that were advised, without what the rig file says of the period."""

@@ -25,9 +25,11 @@ import numpy as np
 from slrig.capture import CameraLatency, LatencyMeasurement, measure_latency, measure_trigger_period
 from slrig.devices import CameraSettings, Rig, Synchronisation
 from slrig.doctor.light import CameraSession, Finding, LightMeasurement, camera_label, fault, format_ms, note, ok
-from slrig.errors import ScanEvidenceError
+from slrig.errors import FrameTimeoutError, PatternError, ScanEvidenceError, UnsupportedByDeviceError
 from slrig.jobs.listener import SILENT, Listener
-from slrig.model import Black, FloatArray, Frame, PatternSequence, Size, White
+from slrig.live.plan import live_plan
+from slrig.live.player import play
+from slrig.model import Axis, Black, FloatArray, Frame, PatternSequence, Shot, Size, White
 
 _SHOWS = 48
 _MAX_SHOW_PAUSE_S = 0.04
@@ -58,6 +60,8 @@ _MAX_OSCILLATIONS = 4
 _MAX_FALSE_ALARM = 1e-6
 _SPECTRUM_OVERSAMPLING = 5
 _ALIAS_SHARE = 0.9
+
+_LIVE_CYCLES = 3
 _MIN_SAMPLES = 16
 _MIN_ATTENUATION = 0.1
 
@@ -200,6 +204,27 @@ def measure_pulses(rig: Rig, sequence: PatternSequence) -> tuple[float | None, l
         "the first scan is played again, more slowly"
     )
     return least_s, [note("timing.pulses", "cameras", f"{message}{format_ms(least_s)}", remedy)]
+
+
+def measure_live(rig: Rig, camera: str, exposure_s: float | None) -> Finding:
+    """Return how many depth images a second live depth gives of a camera, by a few cycles of it. Raises DeviceError."""
+    begins_s: list[float] = []
+
+    def take(_pattern: int, _shot: Shot, begin_s: float, _end_s: float) -> None:
+        begins_s.append(begin_s)
+
+    subject = camera_label(camera)
+    try:
+        plan = live_plan(rig.projector.info, Axis.COLUMN)
+        wanted = _LIVE_CYCLES * len(plan.patterns) + 1
+        play(rig, plan, camera, take, lambda: len(begins_s) >= wanted, exposure_s=exposure_s)
+    except (PatternError, ScanEvidenceError, FrameTimeoutError, UnsupportedByDeviceError) as error:
+        remedy = "aim by the live picture; scans do not need live depth"
+        return note("timing.live", subject, f"live depth cannot be played: {error}", remedy)
+    frame_s = (begins_s[-1] - begins_s[0]) / (len(begins_s) - 1)
+    window_s = frame_s * len(plan.patterns)
+    message = f"live depth gives {1 / frame_s:.1f} depth images a second, each of {window_s:.2f} s of light"
+    return ok("timing.live", subject, message)
 
 
 def waiting_time_s(synchronisation: Synchronisation | None) -> float:

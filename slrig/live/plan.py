@@ -18,6 +18,7 @@ adds, does not reach the phase, and contradicts no pixel that stands still."""
 PERIODS = 32
 """Fine periods across the projector: more are finer, and need a coarse phase with less noise to be numbered."""
 
+_LEAST_PERIOD_PX = 8.0  # of a sinusoid that cameras resolve
 _MARGIN = 1.06  # of the coarse period over the projector's extent, so that noise wraps no phase at its ends
 _LINE_PERIOD_PX, _LINE_STEPS, _LINE_WIDTH_PX = 12, 6, 5
 """Of binary lines. Six steps keep harmonics 2 to 4 from the phase, and 5 of 12 pixels make little of the fifth."""
@@ -76,7 +77,7 @@ def live_plan(projector: ProjectorInfo, axis: Axis) -> LivePlan:
 
 def _sine_plan(size: Size, axis: Axis) -> LivePlan:
     extent_px = size.along(axis)
-    fine_px, coarse_px = extent_px / PERIODS, extent_px * _MARGIN
+    fine_px, coarse_px = max(extent_px / PERIODS, _LEAST_PERIOD_PX), extent_px * _MARGIN
     patterns = [Sine(axis, period_px, shift, STEPS) for period_px in (fine_px, coarse_px) for shift in range(STEPS)]
     return LivePlan(axis, tuple(patterns), tuple(range(STEPS)), tuple(range(STEPS, 2 * STEPS)))
 
