@@ -8,7 +8,7 @@ are slrig's own: x right, y down, z ahead.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -24,6 +24,8 @@ MM_PER_M = 1000.0
 
 POINT_FIELDS = ("x", "y", "z", "normal_x", "normal_y", "normal_z", "rgb", "sigma")
 """Numbers of a point, float32; PCL and RViz read those of its known names."""
+
+LIVE_FIELDS = ("x", "y", "z", "sigma", "intensity")
 
 TF_STATIC = "/tf_static"
 _FLOAT32 = 7  # sensor_msgs/msg/PointField
@@ -126,14 +128,24 @@ class Messages:
 
     def points(self, cloud: Points) -> Any:
         """sensor_msgs/msg/PointCloud2: in the world, m, organised as the camera's image."""
-        table = point_table(cloud, units_per_mm=1 / MM_PER_M)
+        return self._cloud(point_table(cloud, units_per_mm=1 / MM_PER_M), POINT_FIELDS, self.world)
+
+    def live_points(self, name: str, points_mm: NDArray[Any], sigma_mm: NDArray[Any], grey: NDArray[Any]) -> Any:
+        """sensor_msgs/msg/PointCloud2: a live depth image of a camera, in its own frame, m, organised. points_mm : (h,
+        w, 3); sigma_mm, grey : (h, w).
+        """
+        parts = points_mm / MM_PER_M, sigma_mm[..., None] / MM_PER_M, grey[..., None]
+        table = np.concatenate(parts, axis=2).astype("<f4")
+        return self._cloud(table, LIVE_FIELDS, name + FRAME)
+
+    def _cloud(self, table: NDArray[np.float32], names: Sequence[str], frame: str) -> Any:
         high, wide, count = table.shape
         fields = [
             self.class_of("sensor_msgs/msg/PointField")(name=name, offset=4 * place, datatype=_FLOAT32, count=1)
-            for place, name in enumerate(POINT_FIELDS)
+            for place, name in enumerate(names)
         ]
         return self.class_of("sensor_msgs/msg/PointCloud2")(
-            header=self._header(self.world),
+            header=self._header(frame),
             height=high,
             width=wide,
             fields=fields,

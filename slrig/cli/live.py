@@ -35,7 +35,7 @@ def live(
         Path | None, typer.Option(metavar="FOLDER", help="New folder for an organised cloud (PCD) of each depth image.")
     ] = None,
 ) -> None:
-    """See the shape while you aim: depth of an idle rig, several times a second.
+    """Show depth many times a second, while you aim.
 
     The projector repeats a short sequence, and each new frame gives a new depth image. Prints what it says of the aim;
     the page shows it as pictures. A scan goes first, and live depth goes on after it.

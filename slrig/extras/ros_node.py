@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from threading import Lock
+from threading import Event, Lock, Thread
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,8 @@ _THREADS = 32
 """More than scans that wait in the service's line (`queue_length`, 16), so that none keeps another callback waiting."""
 _LOOK_S = 0.25
 """How often goals are looked at: rclpy notes that one is to be cancelled only after it has asked whether it may be."""
+_AGAIN_S = 2.0
+"""Until live depth that ended is begun again."""
 _ADVICE = {
     "rig-busy": " A goal with queue: true waits.",
     "service": " To this node an address is given by -p url:=http://HOST:8731.",
@@ -49,7 +51,8 @@ class _Run:
 
 
 class ScanNode:
-    """What the node does. node : rclpy's, which offers it. world : the frame of the points.
+    """What the node does. node : rclpy's, which offers it. world : the frame of the points. live : a camera whose live
+    depth is published while somebody subscribes to `~/CAMERA/live`; empty for none.
 
     Raises
     ------
@@ -57,7 +60,7 @@ class ScanNode:
         One of ROS's packages of messages is missing.
     """
 
-    def __init__(self, node: Any, client: Client, *, world: str = WORLD) -> None:
+    def __init__(self, node: Any, client: Client, *, world: str = WORLD, live: str = "") -> None:
         from rclpy.action import ActionServer, CancelResponse
         from rclpy.callback_groups import ReentrantCallbackGroup
         from rclpy.task import Future
@@ -68,10 +71,12 @@ class ScanNode:
         self._publishers: dict[str, Any] = {}
         self._runs: set[_Run] = set()
         self._publishing = Lock()
-        self._stopping = False
+        self._stopping = Event()
         self.stopped = Future()
         for kind in ("sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage"):
             _class_of(kind)
+        if live:
+            Thread(target=self._show_live, args=(live,), name="slrig-live", daemon=True).start()
         beside = ReentrantCallbackGroup()
         node.create_service(_class_of("std_srvs/srv/Trigger"), "~/scan", self.answer, callback_group=beside)
         node.create_timer(_LOOK_S, self._look, callback_group=beside)
@@ -139,17 +144,17 @@ class ScanNode:
 
     def stop(self) -> None:
         """Cancel all scans. `stopped` is done when they have ended."""
-        self._stopping = True
+        self._stopping.set()
 
     def _look(self) -> None:
         for run in list(self._runs):
-            if run.job and not run.is_cancelled and (self._stopping or run.is_unwanted()):
+            if run.job and not run.is_cancelled and (self._stopping.is_set() or run.is_unwanted()):
                 run.is_cancelled = True
                 try:
                     run.job.cancel()
                 except SlrigError as error:
                     self._fault(error)
-        if self._stopping and not self._runs:
+        if self._stopping.is_set() and not self._runs:
             self.stopped.set_result(None)
 
     def _fault(self, error: SlrigError) -> str:
@@ -171,6 +176,26 @@ class ScanNode:
                 self._send(topic(name, "camera_info", under="~"), messages.camera_info(name, device))
                 if f"points-{name}.npz" in result.files:
                     self._send(topic(name, "points", under="~"), messages.points(result.cloud(name)))
+
+    def _show_live(self, camera: str) -> None:
+        """Publish live depth while somebody subscribes. On a thread of its own."""
+        where = topic(camera, "live", under="~")
+        publisher = self._node.create_publisher(_class_of("sensor_msgs/msg/PointCloud2"), where, 1)
+        while not self._stopping.is_set():
+            self._stopping.wait(_LOOK_S)
+            if not publisher.get_subscription_count():
+                continue
+            try:
+                self._client.live.start(camera)
+                for frame in self._client.live.watch():
+                    if self._stopping.is_set() or not publisher.get_subscription_count():
+                        break
+                    seconds = self._node.get_clock().now().nanoseconds / 1e9
+                    messages = Messages(class_of=_class_of, sequence=_sequence, seconds=seconds, world=self._world)
+                    publisher.publish(messages.live_points(camera, frame.points_mm, frame.sigma_mm, frame.grey))
+            except SlrigError as error:
+                self._fault(error)
+                self._stopping.wait(_AGAIN_S)
 
     def _send(self, where: str, message: Any) -> None:
         if where not in self._publishers:
@@ -235,7 +260,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         url = node.declare_parameter("url", "").value
         world = node.declare_parameter("world", WORLD).value
         with Client(url or None) as client:
-            scans = ScanNode(node, client, world=world)
+            scans = ScanNode(node, client, world=world, live=node.declare_parameter("live", "").value)
 
             def stop(number: int, _frame: object) -> None:
                 # Once more ends it at once.

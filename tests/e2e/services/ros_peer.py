@@ -72,12 +72,12 @@ class Peer:
             lambda future: tell(service, answer=str(future.result()))
         )
 
-    def read(self, topic: str, kind: str, path: str) -> None:
+    def read(self, topic: str, kind: str, path: str, *, latched: bool = True) -> None:
         def came(message: Any) -> None:
             Path(path).write_bytes(serialize_message(message))
             tell(topic)
 
-        self.node.create_subscription(class_of(kind), topic, came, LATCHED)
+        self.node.create_subscription(class_of(kind), topic, came, LATCHED if latched else 1)
 
 
 # A test that waits in vain is told by the end of this.

@@ -112,7 +112,7 @@ def test_a_program_of_ros_scans_cancels_and_reads_what_was_published(python: str
     (unbuilt / "slrig_interfaces" / "__init__.py").touch()
     words = *NODE, f"url:={url}"
     with (
-        running(python, tmp_path / "node.log", *words) as node,
+        running(python, tmp_path / "node.log", *words, "-p", "live:=left") as node,
         running(python, tmp_path / "plain.log", *words, "-r", "__node:=plain", path=unbuilt) as plain,
         running(python, tmp_path / "peer.log", str(PEER)) as peer,
     ):
@@ -188,6 +188,17 @@ def test_a_program_of_ros_scans_cancels_and_reads_what_was_published(python: str
             lit_by = seen_at(transforms, projector, at)
             assert ((lit_by > -0.5) & (lit_by < [projector.width, projector.height])).all()
             assert [each.header.frame_id for each in (points, left)] == ["world", "left_optical_frame"]
+
+            # Live depth begins with who subscribes to it.
+            with running(python, tmp_path / "live.log", str(PEER)) as viewer:
+                path = str(tmp_path / "live")
+                viewer.do(
+                    "read", topic="/slrig/left/live", kind=LATCHED["/slrig/left/points"], path=path, latched=False
+                )
+                viewer.hear("/slrig/left/live")
+            shown = store.deserialize_cdr(Path(path).read_bytes(), cloud_kind)
+            assert (shown.header.frame_id, shown.width, shown.height) == ("left_optical_frame", 80, 64)
+            assert 0.4 < np.nanmedian(point_columns(shown)["z"]) < 0.8
 
             # A node that is ended cancels what it began, and tells who waits for it.
             peer.do("goal", name="last", preset="long")
