@@ -1,8 +1,9 @@
-"""Errors of a disk as messages, and names of files that are being written."""
+"""Errors of a disk as messages, names of files that are being written, and where compiled kernels are kept."""
 
 from __future__ import annotations
 
 import errno
+import os
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -35,3 +36,14 @@ def storage_errors(path: Path) -> Iterator[None]:
 def staging_name(path: Path) -> Path:
     """Return a unique hidden name in the folder of `path`."""
     return path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.part")
+
+
+def prepare_kernel_cache(folder: Path) -> None:
+    """Tell numba where to keep compiled kernels when slrig's own folder is read-only; call before numba is loaded.
+
+    numba itself refuses to load a cached kernel when it finds no place to write, as under systemd or in a container.
+    """
+    package = Path(__file__).resolve().parent
+    if "NUMBA_CACHE_DIR" not in os.environ and not os.access(package, os.W_OK):
+        folder.mkdir(parents=True, exist_ok=True)
+        os.environ["NUMBA_CACHE_DIR"] = str(folder)

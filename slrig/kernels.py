@@ -200,7 +200,7 @@ def _pool() -> ThreadPoolExecutor:
 
 def _compile(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     # Division by zero is infinite or NaN, as in numpy: missing values are NaN, and no kernel raises.
-    compiled: Any = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+    compiled: Any = njit(nogil=True, error_model="numpy", **options)(function)
     if _is_compiled(compiled):  # with NUMBA_DISABLE_JIT it is the function itself
         compiled._cache = _KernelCache(function)  # noqa: SLF001 - numba has no other place to choose a cache
     return compiled
@@ -228,17 +228,24 @@ class _CompilationListener(event.Listener):  # type: ignore[misc] # numba is unt
 class _KernelCache(FunctionCache):  # type: ignore[misc] # numba is untyped
     """numba's cache with files that two processes may write at once, and that depend on the sources of a kernel's
     parts.
+
+    It looks for its folder on the first use: of two hundred kernels and parts that are loaded a run calls a few.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        super().__init__(function)
-        state: dict[str, Any] = self.__dict__
-        state["_cache_file"] = _KeyedFiles(function, state["_cache_file"])
+        self._function = function
+
+    def __getattr__(self, name: str) -> Any:
+        """Called for what numba sets in `__init__`, before the first use."""
+        if "_cache_file" in self.__dict__:
+            raise AttributeError(name)
+        state = dict(vars(FunctionCache(self._function)))
+        self.__dict__.update(state, _cache_file=_KeyedFiles(self._function, state["_cache_file"]))
+        return getattr(self, name)
 
     def is_cached(self) -> bool:
         """True if the disk holds code compiled from the present sources."""
-        files: _KeyedFiles = self.__dict__["_cache_file"]
-        return files.is_cached()
+        return bool(self._cache_file.is_cached())
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save compiled code. If the disk refuses, the next start compiles again, but nothing fails."""
@@ -277,7 +284,10 @@ class _KeyedFiles(IndexDataCacheFile):  # type: ignore[misc] # numba is untyped
 
     def is_cached(self) -> bool:
         begin = f"{self._base}.{self._digest_of_sources()}."
-        return _shipped().has(begin) or any(Path(self._cache_path).glob(f"{glob.escape(begin)}*.nbc"))
+        return _shipped().has(begin) or any(
+            name.startswith(begin) and name.endswith(".nbc")
+            for name in os.listdir(self._cache_path)  # noqa: PTH208 - fast
+        )
 
     def flush(self) -> None:
         for old in Path(self._cache_path).glob(f"{glob.escape(self._base)}.*.nbc"):

@@ -47,7 +47,7 @@ from slrig.calibrate.store import session_readings, setting_of
 from slrig.calibrate.verification import VerificationJob, health_svg
 from slrig.calibration import Board
 from slrig.calibration.health import THRESHOLDS, DriftEstimate, HealthState, PairFigures, Thresholds
-from slrig.capture import DEFAULT_SEARCH_S, DEFAULT_TRIALS
+from slrig.capture.latency import DEFAULT_SEARCH_S, DEFAULT_TRIALS
 from slrig.conformance import ConformanceJob
 from slrig.devices import CameraInfo, FoundDevice, Trigger
 from slrig.discovery import InstalledDriver, MissingLibrary, OtherSystem, installed_drivers

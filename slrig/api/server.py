@@ -39,6 +39,7 @@ from slrig.compute.security import require_pool_extra
 from slrig.config import RigConfig, ServiceSettings, is_loopback
 from slrig.conformance import ConformanceJob
 from slrig.discovery import open_rig
+from slrig.disk import prepare_kernel_cache
 from slrig.doctor import DoctorJob, LatencyJob
 from slrig.errors import ConfigError, InvalidInputError, ServiceError
 from slrig.jobs.data_folder import DataFolder
@@ -46,7 +47,7 @@ from slrig.jobs.database import Database
 from slrig.jobs.manager import JobManager
 from slrig.jobs.records import utc_now
 from slrig.jobs.store import Copies, JobStore, Outbox
-from slrig.jobs.worker import LOADING, READY, Compute, Worker, prepare_kernel_cache
+from slrig.jobs.worker import LOADING, READY, Compute, Worker
 from slrig.logs import set_up_logs
 from slrig.model_jobs.job import TURNTABLE, ModelJob
 from slrig.rig.session import RigSession

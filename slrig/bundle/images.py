@@ -18,7 +18,6 @@ from typing import Any, NoReturn
 
 import cv2
 import numpy as np
-import tifffile
 from isal import isal_zlib
 
 from slrig.errors import BundleError
@@ -67,7 +66,6 @@ _TIFF_KINDS = (("MINISBLACK", 1), ("RGB", 3), ("RGB", 4))  # photometric interpr
 TIFF_COMPRESSIONS = (1, 5, *TIFF_ZLIB)  # none, LZW
 MAX_FILE_BYTES = 2**31
 TIFF_FAULTS = (
-    tifffile.TiffFileError,
     struct.error,
     ArithmeticError,
     AttributeError,
@@ -356,8 +354,10 @@ def read_page_formats(path: Path) -> dict[int, CameraFormat]:
             jpeg = JpegHeader.from_bytes(data)
             width, height, bits = jpeg.width, jpeg.height, 8
         elif data.startswith(TIFF_SIGNATURES):
+            from tifffile import TiffFile
+
             count_tiff_pages(data)
-            with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+            with TiffFile(io.BytesIO(data)) as tiff:
                 sizes = [(page.imagewidth, page.imagelength, page.bitspersample) for page in tiff.pages]
                 (width, height, bits), *others = sizes
         else:
@@ -472,9 +472,12 @@ def _jpeg(path: Path, data: bytes, camera: CameraFormat) -> Pixels | None:
 
 
 def _check_tiff(path: Path, data: bytes, pages: Sequence[int], camera: CameraFormat) -> None:
+    # Takes 30 ms to import, and most bundles hold PNG.
+    from tifffile import TiffFile
+
     try:
         count = count_tiff_pages(data)
-        with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+        with TiffFile(io.BytesIO(data)) as tiff:
             if max(pages) >= count:
                 _refuse(path, f"a page {max(pages)}", f"{count} pages", "correct `page`, which counts from 0")
             for index in dict.fromkeys(pages):

@@ -10,6 +10,7 @@ import os
 import shlex
 import sys
 from collections.abc import Mapping
+from copy import copy
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -19,6 +20,7 @@ import typer.core
 
 from slrig.cli import calibrate, scans, schedule
 from slrig.cli.live import live
+from slrig.cli.loading import loading
 from slrig.cli.model import model, turntable_app
 from slrig.cli.options import (
     AcceptanceOptions,
@@ -423,7 +425,8 @@ def reconstruct(
     ] = False,
 ) -> None:
     """Make meshes from recorded scans. Needs no service and no rig."""
-    from slrig.cli.reconstruct import decode_and_tell, reconstruct_and_tell
+    with loading():
+        from slrig.cli.reconstruct import decode_and_tell, reconstruct_and_tell
 
     if decode_only:
         decode_and_tell(bundles, output)
@@ -716,14 +719,30 @@ app.command()(worker)
 app.command()(fleet)
 
 
+def _with_only(name: str) -> typer.Typer:
+    """`app` with the one command or group of this name, because typer builds all that there are, which takes 50 ms;
+    all of them for another name, as of an option.
+    """
+    one = copy(app)
+    one.registered_groups = [each for each in app.registered_groups if each.name == name]
+    one.registered_commands = [
+        each
+        for each in app.registered_commands
+        if name == (each.name or getattr(each.callback, "__name__", "").replace("_", "-"))
+    ]
+    return one if one.registered_groups or one.registered_commands else app
+
+
 def main() -> None:
     """Run the command that the arguments name."""
     # Before numpy is loaded, here and in what commands start. OpenBLAS's threads wait for work by spinning, for 2**26
     # ticks after each product (its THREAD_TIMEOUT), beside kernels, captures and other programs.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Before pydantic is loaded, which else reads the metadata of all packages: slrig uses no plug-in of pydantic's.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     # A reader that has seen enough (slrig devices | head) closes the pipe: that is no error.
     try:
-        app(prog_name="slrig")
+        _with_only(sys.argv[1] if len(sys.argv) > 1 else "")(prog_name="slrig")
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)

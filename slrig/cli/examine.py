@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from slrig.api.schemas import ScanRequest, scan_plan
-from slrig.capture import STEADY_TOLERANCE, CameraLatency
+from slrig.capture.latency import STEADY_TOLERANCE, CameraLatency
 from slrig.cli.display import print_json, progress_shown
 from slrig.cli.local import run_job
 from slrig.cli.options import given

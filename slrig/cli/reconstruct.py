@@ -18,11 +18,11 @@ from rich.table import Column
 
 from slrig.bundle import DESCRIPTION, natural_sort_key, read_calibration, read_description, write_file
 from slrig.cli.display import ProgressDisplay, counted, print_table, progress_shown, quality_lines
-from slrig.disk import storage_errors
+from slrig.cli.loading import loading
+from slrig.disk import prepare_kernel_cache, storage_errors
 from slrig.errors import ConfigError, ExtraMissingError
 from slrig.failure import UNEXPECTED, job_failure
 from slrig.jobs.listener import PREPARING, Listener
-from slrig.jobs.worker import prepare_kernel_cache
 from slrig.logs import set_up_console_logs
 from slrig.scan.artefacts import MESH, ON_REQUEST, REPORT, report_summary, write_converted
 from slrig.scan.formats import BUNDLE_ZIP, CALIBRATION_USED, missing_for, offered, on_demand
@@ -347,9 +347,9 @@ def prepare_kernels(display: ProgressDisplay) -> int:
     """Compile the kernels of a usual scan that no earlier run has, under progress; return how many there are."""
     keep_kernels()
     display("loading", 0.0, "")
-    # numba itself: a second.
-    from slrig.kernels import KernelCount, are_all_cached, count_prepared
-    from slrig.scan.reconstruct import warm_kernels
+    with loading():
+        from slrig.kernels import KernelCount, are_all_cached, count_prepared
+        from slrig.scan.reconstruct import warm_kernels
 
     def told(now: KernelCount) -> None:
         display(PREPARING, 0.0, f"first time only: {now.done} of {now.total}")

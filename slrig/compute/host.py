@@ -43,13 +43,13 @@ from slrig.compute.link import (
 )
 from slrig.compute.security import PoolAddress, require_private
 from slrig.config import is_loopback, read_private_text
-from slrig.disk import storage_errors
+from slrig.disk import prepare_kernel_cache, storage_errors
 from slrig.errors import ConfigError, ScanCancelledError, WorkerLostError
 from slrig.failure import JobFailure, job_failure
 from slrig.jobs.job import JobRun
 from slrig.jobs.listener import Listener
 from slrig.jobs.records import versions
-from slrig.jobs.worker import POLL_S, READY, Compute, Task, Worker, job_task, prepare_kernel_cache
+from slrig.jobs.worker import POLL_S, READY, Compute, Task, Worker, job_task
 from slrig.scan.job import PIPELINE, ScanJob
 from slrig.scan.plan import ScanPlan
 

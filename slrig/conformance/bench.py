@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.capture import stable_from_ns
+from slrig.capture.latency import stable_from_ns
 from slrig.devices import AppliedSettings, Camera, CameraSettings, DisplayedPattern, Projector, Rig, Trigger
 from slrig.errors import SlrigError
 from slrig.model import Black, Frame, PatternSequence, Pixels, White

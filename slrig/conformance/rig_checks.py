@@ -10,7 +10,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from slrig.capture import Evidence, capture, choose_triggers
+from slrig.capture import Evidence
+from slrig.capture.sequencer import capture, choose_triggers
 from slrig.conformance.bench import (
     ABSENT_FRAME_WAIT_S,
     FRAME_WAIT_S,

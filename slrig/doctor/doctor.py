@@ -10,14 +10,10 @@ from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 
-from slrig.capture import (
-    DEFAULT_SEARCH_S,
-    CameraLatency,
-    LatencyMeasurement,
-    choose_triggers,
-    differs_from_request,
-    earliest_change_s,
-)
+from slrig.capture.latency import DEFAULT_SEARCH_S, CameraLatency, LatencyMeasurement
+from slrig.capture.sequencer import choose_triggers
+from slrig.capture.streaming import earliest_change_s
+from slrig.capture.triggering import differs_from_request
 from slrig.devices import (
     CameraInfo,
     FoundDevice,

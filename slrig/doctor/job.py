@@ -16,7 +16,7 @@ import structlog
 from pydantic import BaseModel, Field, ValidationError
 
 from slrig.bundle import write_file
-from slrig.capture import DEFAULT_SEARCH_S, DEFAULT_TRIALS, measure_latency
+from slrig.capture.latency import DEFAULT_SEARCH_S, DEFAULT_TRIALS, measure_latency
 from slrig.devices import Rig, Trigger
 from slrig.discovery import discover_devices, installed_drivers
 from slrig.doctor.doctor import examine, latency_document

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.bundle import RefusedFrame
-from slrig.capture import Contradiction, Evidence, stable_from_ns
+from slrig.capture import Contradiction, Evidence
+from slrig.capture.latency import stable_from_ns
 from slrig.devices import Camera, CameraSettings, Projector, Rig, Trigger, UnknownPolarityProjector
 from slrig.doctor.measures import (
     MIN_SNR,

@@ -22,7 +22,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slrig.capture import CameraLatency, LatencyMeasurement, measure_latency, measure_trigger_period
+from slrig.capture.latency import CameraLatency, LatencyMeasurement, measure_latency
+from slrig.capture.pulses import measure_trigger_period
 from slrig.devices import CameraSettings, Rig, Synchronisation
 from slrig.doctor.light import CameraSession, Finding, LightMeasurement, camera_label, fault, format_ms, note, ok
 from slrig.errors import FrameTimeoutError, PatternError, ScanEvidenceError, UnsupportedByDeviceError

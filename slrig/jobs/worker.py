@@ -633,17 +633,6 @@ class Worker:
             process.join()
 
 
-def prepare_kernel_cache(folder: Path) -> None:
-    """Tell numba where to keep compiled kernels when slrig's own folder is read-only; call before numba is loaded.
-
-    numba itself refuses to load a cached kernel when it finds no place to write, as under systemd or in a container.
-    """
-    package = Path(__file__).resolve().parent.parent
-    if "NUMBA_CACHE_DIR" not in os.environ and not os.access(package, os.W_OK):
-        folder.mkdir(parents=True, exist_ok=True)
-        os.environ["NUMBA_CACHE_DIR"] = str(folder)
-
-
 def _error(failed: Failed) -> Exception:
     known = errors_by_code().get(failed.fault.code)
     return UnexpectedWorkerError(failed.trace) if known is None else known(failed.fault.message)

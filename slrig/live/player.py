@@ -6,7 +6,8 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 
 from slrig.bundle import RefusedFrame
-from slrig.capture import Contradiction, capture
+from slrig.capture import Contradiction
+from slrig.capture.sequencer import capture
 from slrig.devices import CameraSettings, Rig
 from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError, UnsupportedByDeviceError
 from slrig.live.plan import LivePlan

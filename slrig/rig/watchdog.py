@@ -17,7 +17,7 @@ from typing import Generic, TypeVar
 
 import structlog
 
-from slrig.capture import differs_from_request
+from slrig.capture.triggering import differs_from_request
 from slrig.devices import (
     DEFAULT_LIMITS,
     AppliedSettings,

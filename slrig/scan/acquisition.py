@@ -41,13 +41,12 @@ from slrig.capture import (
     Sampler,
     Samples,
     bracket_summary,
-    capture,
-    choose_triggers,
     detect_movement,
-    differs_from_request,
     judge_exposure,
     round_to_refresh_s,
 )
+from slrig.capture.sequencer import capture, choose_triggers
+from slrig.capture.triggering import differs_from_request
 from slrig.devices import Camera, CameraSettings, Rig, Trigger, Turntable
 from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError
 from slrig.failure import disk_errors

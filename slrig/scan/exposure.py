@@ -19,9 +19,9 @@ from slrig.capture import (
     SampleMask,
     Sampler,
     Samples,
-    capture,
     round_to_refresh_s,
 )
+from slrig.capture.sequencer import capture
 from slrig.devices import CameraSettings, Rig
 from slrig.errors import ConfigError, RigBusyError, UnsupportedByDeviceError
 from slrig.jobs.listener import SILENT, Listener

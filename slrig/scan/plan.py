@@ -12,6 +12,7 @@ from datetime import datetime, timedelta
 from enum import StrEnum
 from math import asin, degrees
 from pathlib import Path
+from typing import TYPE_CHECKING
 from uuid import UUID
 
 from slrig.bundle import (
@@ -24,7 +25,6 @@ from slrig.bundle import (
     read_json_model,
     write_file,
 )
-from slrig.devices import CameraInfo, ProjectorInfo, Rig
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError, PatternError, PresetNotFoundError, UnsupportedByDeviceError, setting
 from slrig.model import (
@@ -48,7 +48,11 @@ from slrig.model import (
     triangulated_axis,
 )
 from slrig.patterns import SEQUENCES, SequenceOptions, encode, phase_patterns, scan_patterns, with_cross_lines
-from slrig.rig.session import RigFacts
+
+if TYPE_CHECKING:
+    # For annotations alone: a reconstruction of recorded frames has no rig.
+    from slrig.devices import CameraInfo, ProjectorInfo, Rig
+    from slrig.rig.session import RigFacts
 
 _OF_LINES = (
     "line_shift", "line_shift_period_px", "line_steps", "line_width_px", "gray_cell_px", "gray_offset_px", "inverses",

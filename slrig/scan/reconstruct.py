@@ -13,7 +13,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 
 from slrig.bundle import read_capture, read_health, read_notes, read_truth, read_turntable_angle, write_file
@@ -585,6 +584,8 @@ def decode_bundle(bundle: Path, output: Path) -> tuple[list[Decoded], tuple[str,
 
 
 def _decoded(capture: Capture, camera: str, axis: Axis, folder: Path) -> Decoded:
+    from tifffile import imwrite
+
     frames, noise = _frames(capture, camera, axis)
     limits = DecodingLimits()
     lit = lit_pixels(frames, noise, limits)
@@ -600,7 +601,7 @@ def _decoded(capture: Capture, camera: str, axis: Axis, folder: Path) -> Decoded
         position = position_map(frames, noise, code, cells).position
     name = f"{camera}-{axis.value}"
     with storage_errors(folder):
-        tifffile.imwrite(folder / f"position-{name}.tiff", position)
+        imwrite(folder / f"position-{name}.tiff", position)
     coloured = encode_png(_coloured(position, capture.projector.along(axis)))
     write_file(folder / f"position-{name}.png", coloured)
     white = np.clip(np.rint(frames.white), 0, np.iinfo(np.uint16).max).astype(np.uint16)

@@ -54,6 +54,8 @@ PUBLIC_MODULES = {
     *(f"slrig.calibration.{name}" for name in ("accuracy", "judgement", "printing")),
     *(f"slrig.calibration.{name}" for name in ("detection", "health", "health.drift", "health.verification")),
     *(f"slrig.calibration.{name}" for name in ("poses", "solving")),
+    # These drive a rig, which a reconstruction of recorded frames has not.
+    *(f"slrig.capture.{name}" for name in ("latency", "pulses", "sequencer", "streaming", "triggering")),
     # The rendered rig must not import slrig's lens: a contract names these two modules.
     "slrig.model.lens", "slrig.model.lens_kernels",
 }  # fmt: skip

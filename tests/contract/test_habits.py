@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slrig.capture import capture, measure_latency
+from slrig.capture.latency import measure_latency
+from slrig.capture.sequencer import capture
 from slrig.devices import CameraSettings, Rig
 from slrig.doctor.doctor import Diagnosis, examine
 from slrig.doctor.light import Severity

@@ -108,10 +108,21 @@ def test_help_and_version_load_nothing_heavy() -> None:
 
 
 def test_the_reconstruction_loads_neither_a_database_nor_what_few_scans_need() -> None:
-    heavy = {"sqlalchemy", "alembic", "fastapi", "httpx2", "trimesh", "reportlab"}
+    heavy = {"sqlalchemy", "alembic", "fastapi", "httpx2", "trimesh", "reportlab", "tifffile"}
     heavy |= {f"scipy.{each}" for each in ("ndimage", "optimize", "sparse", "spatial", "special")}
-    modules = "slrig.jobs.worker, slrig.cli.reconstruct, slrig.scan.reconstruct"
-    code = f"import sys, {modules}\nprint(sorted({heavy} & set(sys.modules)))"
+    of_rigs = {
+        "slrig.devices",
+        "slrig.rig",
+        "slrig.jobs.worker",
+        "slrig.jobs.data_folder",
+        "filelock",
+        "multiprocessing",
+    }
+    code = (
+        "import sys, slrig.cli.reconstruct, slrig.scan.reconstruct\n"
+        f"found = {heavy | of_rigs} & set(sys.modules)\n"
+        f"import slrig.jobs.worker\nprint(sorted(found | {heavy} & set(sys.modules)))"
+    )
     assert printed(code) == "[]"
 
 

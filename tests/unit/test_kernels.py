@@ -21,6 +21,7 @@ from numba import config
 from numba.core.errors import NumbaError
 
 from slrig import kernels
+from slrig.disk import prepare_kernel_cache
 from slrig.kernels import (
     CPU_LEVELS,
     are_all_cached,
@@ -345,3 +346,17 @@ def test_a_part_that_borrows_reads_the_arrays_of_a_tuple_and_makes_none() -> Non
     assert _product(held, 1) == -4.0
     with pytest.raises(NumbaError, match="array"):
         _makes_an_array(held)
+
+
+def test_kernel_cache_moves_only_when_the_package_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    monkeypatch.setattr(os, "access", lambda *_: True)
+    prepare_kernel_cache(tmp_path / "cache")
+    assert "NUMBA_CACHE_DIR" not in os.environ
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    prepare_kernel_cache(tmp_path / "cache")
+    assert os.environ["NUMBA_CACHE_DIR"] == str(tmp_path / "cache")
+    assert (tmp_path / "cache").is_dir()

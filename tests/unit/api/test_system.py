@@ -18,7 +18,7 @@ from structlog.testing import capture_logs
 
 from slrig.api import service as latency
 from slrig.api.service import Durations, Latency
-from slrig.capture import CameraLatency, LatencyMeasurement
+from slrig.capture.latency import CameraLatency, LatencyMeasurement
 from slrig.conformance import CheckOutcome, CheckResult, ConformanceReport, Failure
 from slrig.conformance import job as conforming
 from slrig.devices import AppliedSettings, CameraSettings

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from slrig.bundle import RefusedFrame
-from slrig.capture import capture
+from slrig.capture.sequencer import capture
 from slrig.capture.verifier import Evidence, EvidenceSummary, check_capture
 from slrig.model import Axis, Black, Capture, Gray, Pattern, Pixels, Shot, Sine, Size, White
 from slrig.patterns import encode

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from simulated_rig.device import SimulatedHead, open_head
-from slrig.capture import measure_latency
+from slrig.capture.latency import measure_latency
 from slrig.devices import AppliedSettings, Camera, CameraSettings, Projector, Rig, Trigger
 from slrig.doctor import timing
 from slrig.doctor.doctor import Diagnosis, doctor_sequence, examine

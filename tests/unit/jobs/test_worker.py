@@ -55,7 +55,6 @@ from slrig.jobs.worker import (
     Unloadable,
     Worker,
     _beat,
-    prepare_kernel_cache,
     serve,
 )
 from slrig.model import Shot
@@ -361,20 +360,6 @@ def test_condition_comes_back_from_a_worker_that_was_closed_while_it_loaded() ->
     asking.join(WAIT_S)
     assert not asking.is_alive()
     assert not closed.loading
-
-
-def test_kernel_cache_moves_only_when_the_package_cannot_be_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
-    monkeypatch.delenv("NUMBA_CACHE_DIR")
-    monkeypatch.setattr(os, "access", lambda *_: True)
-    prepare_kernel_cache(tmp_path / "cache")
-    assert "NUMBA_CACHE_DIR" not in os.environ
-    monkeypatch.setattr(os, "access", lambda *_: False)
-    prepare_kernel_cache(tmp_path / "cache")
-    assert os.environ["NUMBA_CACHE_DIR"] == str(tmp_path / "cache")
-    assert (tmp_path / "cache").is_dir()
 
 
 def test_a_task_that_cannot_begin_in_time_is_refused_and_the_worker_goes_on(worker: Worker, tmp_path: Path) -> None:

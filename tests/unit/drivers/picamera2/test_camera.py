@@ -15,7 +15,7 @@ import pytest
 
 from drivers.picamera2 import PiCamera, find_devices, open_camera
 from drivers.picamera2 import camera as camera_module
-from slrig.capture import capture
+from slrig.capture.sequencer import capture
 from slrig.devices import CameraSettings, Rig, Trigger
 from slrig.errors import (
     DeviceBusyError,
