@@ -6,8 +6,8 @@ SLRIG_API_KEY=... python config/examples/scan_and_plot.py depth.png
 
 import sys
 
+import cv2
 import numpy as np
-from PIL import Image
 
 from slrig.client import Client
 
@@ -20,7 +20,7 @@ def main(output: str) -> None:
         measured = np.isfinite(depth_mm)
         near_mm, far_mm = np.percentile(depth_mm[measured], [1, 99])
         brightness = 55 + 200 * (far_mm - depth_mm) / max(far_mm - near_mm, 1e-6)
-        Image.fromarray(np.where(measured, brightness, 0).clip(0, 255).astype(np.uint8)).save(output)
+        cv2.imwrite(output, np.where(measured, brightness, 0).clip(0, 255).astype(np.uint8))
         print(f"{measured.sum():,} points from {near_mm:.1f} to {far_mm:.1f} mm")
         print(f"median standard deviation {np.nanmedian(sigma_mm):.4f} mm")
         print(f"{len(result.mesh.faces):,} triangles; the mesh: {result.save('mesh.ply', '.')}")

@@ -108,7 +108,7 @@ def test_help_and_version_load_nothing_heavy() -> None:
 
 
 def test_the_reconstruction_loads_neither_a_database_nor_what_few_scans_need() -> None:
-    heavy = {"sqlalchemy", "alembic", "fastapi", "httpx2", "trimesh", "reportlab", "tifffile"}
+    heavy = {"sqlalchemy", "alembic", "fastapi", "httpx2", "trimesh", "tifffile"}
     heavy |= {f"scipy.{each}" for each in ("ndimage", "optimize", "sparse", "spatial", "special")}
     of_rigs = {
         "slrig.devices",

@@ -355,7 +355,7 @@ def test_a_file_that_the_service_has_no_time_for_is_requested_again(
 
 
 def test_live_pictures_are_arrays_however_the_stream_is_cut() -> None:
-    pictures = [np.full((6, 8), value, np.uint8) for value in (40, 200)]
+    pictures = [np.full((6, 8), 40, np.uint8), np.full((6, 8, 3), (200, 100, 50), np.uint8)]
     sent = b"\r\n\r\n"
     for picture in pictures:
         file = io.BytesIO()
@@ -373,7 +373,8 @@ def test_live_pictures_are_arrays_however_the_stream_is_cut() -> None:
         paths.append(request.url.raw_path.decode())
         return httpx2.Response(200, stream=Pieces())
 
-    np.testing.assert_array_equal([*client_of(handler).rig.pictures("left", marks=True)], pictures)
+    for found, picture in zip(client_of(handler).rig.pictures("left", marks=True), pictures, strict=True):
+        np.testing.assert_array_equal(found, picture)
     assert paths == ["/preview/left?marks=true"]
 
 

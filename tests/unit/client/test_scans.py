@@ -225,7 +225,6 @@ HEAVY = {
     "pydantic",
     "trimesh",
     "sqlalchemy",
-    "PIL",
     "asyncio",
 }
 MOST_S = 0.3
