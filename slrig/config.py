@@ -11,8 +11,16 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 from urllib.parse import urlsplit
 
-from pydantic import AfterValidator, ConfigDict, Field, SecretStr, ValidationError, field_validator, model_validator
-from pydantic_settings import BaseSettings, EnvSettingsSource, NoDecode, SettingsConfigDict
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    SecretStr,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from slrig import data_home
 from slrig.bundle import (
@@ -257,7 +265,7 @@ WebAddress = Annotated[str, Field(max_length=2000), AfterValidator(_require_web_
 """An address of the web, such as that of a webhook."""
 
 
-class ServiceSettings(BaseSettings):
+class ServiceSettings(BaseModel):
     """Settings of the service, from `SLRIG_…` in the environment, then a TOML file, then these defaults.
 
     `require_key` False opens the service to everyone who reaches it, so it is allowed on this machine only.
@@ -280,9 +288,7 @@ class ServiceSettings(BaseSettings):
     elsewhere.
     """
 
-    model_config = SettingsConfigDict(
-        env_prefix="SLRIG_", extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True)
 
     host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 8731
@@ -290,7 +296,7 @@ class ServiceSettings(BaseSettings):
     data_group: Annotated[str, Field(min_length=1)] | None = None
     rig: Path | None = None
     require_key: bool = True
-    allowed_hosts: Annotated[tuple[str, ...], NoDecode] = ()
+    allowed_hosts: tuple[str, ...] = ()
     queue_length: Annotated[int, Field(ge=0, le=1000)] = 16
     backlog_length: Annotated[int, Field(ge=1, le=1000)] = 16
     max_body_bytes: Annotated[int, Field(ge=1024)] = 2**16
@@ -315,7 +321,7 @@ class ServiceSettings(BaseSettings):
     webhook_url: WebAddress | None = None
     webhook_secret: SecretStr | None = None
     webhook_secret_file: Path | None = None
-    webhook_kinds: Annotated[tuple[NoticeKind, ...], NoDecode] = get_args(NoticeKind)
+    webhook_kinds: tuple[NoticeKind, ...] = get_args(NoticeKind)
     mqtt_url: Annotated[str, Field(max_length=2000)] | None = None
     mqtt_login: SecretStr | None = None
     mqtt_login_file: Path | None = None
@@ -379,7 +385,8 @@ def read_settings(path: Path | None = None, **given: object) -> ServiceSettings:
             data[key] = str(path.resolve().parent / Path(data[key]).expanduser())
     source = "settings" if path is None else str(path)
     try:
-        data.update(EnvSettingsSource(ServiceSettings)())
+        in_environment = {name: f"SLRIG_{name.upper()}" for name in ServiceSettings.model_fields}
+        data.update({name: os.environ[named] for name, named in in_environment.items() if named in os.environ})
         data.update(given)
         return ServiceSettings(**data)
     except ValidationError as cause:
