@@ -132,7 +132,7 @@ def resolve_port(name: str) -> str:
 
 def serial_module(driver: str, module: str = "serial") -> Any:
     """Return a module of pyserial. Raises LibraryMissingError."""
-    with loading(driver, "pyserial", install="pip install pyserial", packages="pyserial"):
+    with loading(driver, "pyserial", install="pip install 'slrig[serial]'", packages="pyserial"):
         return importlib.import_module(module)
 
 

@@ -225,6 +225,9 @@ router = APIRouter(prefix="/docs", include_in_schema=False)
 @router.get("")
 def show_interface() -> Response:
     """Show the description of the interface as a page."""
+    if find_spec("fastapi_offline") is None:
+        detail = "This page needs Swagger UI: pip install 'slrig[docs]'. What it shows is /openapi.json."
+        raise HTTPException(404, detail)
     return Response(_PAGE, media_type="text/html")
 
 

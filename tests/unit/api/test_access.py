@@ -705,6 +705,12 @@ def test_the_description_is_a_page_of_our_own(client: TestClient, served: Served
     assert (led.status_code, led.headers["location"]) == (303, "/")
 
 
+def test_the_description_says_what_its_page_lacks(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("slrig.api.app.find_spec", lambda _: None)
+    answer = client.get("/docs")
+    assert (answer.status_code, "pip install 'slrig[docs]'" in answer.json()["detail"]) == (404, True)
+
+
 def test_damaged_file_of_keys_is_a_storage_problem(client: TestClient, served: ServedBench) -> None:
     path = served.service.settings.key_path
     path.write_text("{}")

@@ -360,4 +360,4 @@ def test_without_pyserial_the_driver_says_what_to_install(monkeypatch: pytest.Mo
     for call in (find_devices, lambda: open_projector({"port": "/dev/ttyACM0"}, Path())):
         with pytest.raises(LibraryMissingError) as missing:
             call()
-        assert missing.value.install == "pip install pyserial"
+        assert missing.value.install == "pip install 'slrig[serial]'"
