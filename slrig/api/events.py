@@ -13,7 +13,7 @@ from uuid import UUID
 
 from fastapi import APIRouter, Depends, Header, Query, Response
 from fastapi.concurrency import run_in_threadpool
-from sse_starlette import EventSourceResponse, ServerSentEvent
+from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
 
 from slrig.api.problems import fault_problem, problems
 from slrig.api.service import Service, Serving
@@ -23,8 +23,8 @@ from slrig.failure import JobFailure
 from slrig.jobs.records import RIG_JOBS, JobEvent, JobKind, JobState
 from slrig.jobs.store import EVERY_JOB, JobStore
 
-_LAST_WORD_S = 2.0
-"""How much longer than the work that it follows an event stream may live when the service ends."""
+_HEADERS = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+"""Of a stream: a proxy passes each event on at once, as nginx does by the second."""
 
 _BATCH = 500
 """How many events of all jobs are looked up at once."""
@@ -333,22 +333,24 @@ def _opened(
 ) -> Response:
     """A stream of the events after one. See `told`. Raises HTTPException 429."""
     held.enter_context(service.streams.take())
-    settings = service.settings
-    return EventSourceResponse(
-        told(service.followed, key, followed, after, begins=begins),
-        ping=settings.keepalive_s,
-        sep="\n",
-        # At the end of the service all work ends, and its stream by that; without this the stream would end first.
-        shutdown_grace_period=settings.drain_s + settings.shutdown_s + _LAST_WORD_S,
-    )
+    keepalive_s = service.settings.keepalive_s
+    stream = told(service.followed, key, followed, after, begins=begins, keepalive_s=keepalive_s)
+    return EventSourceResponse(stream, headers=_HEADERS)
 
 
 async def told(
-    open_looks: dict[UUID, SharedLooks], key: UUID, followed: Followed, after: int, *, begins: int | None = None
-) -> AsyncIterator[ServerSentEvent]:
+    open_looks: dict[UUID, SharedLooks],
+    key: UUID,
+    followed: Followed,
+    after: int,
+    *,
+    begins: int | None = None,
+    keepalive_s: float,
+) -> AsyncIterator[bytes]:
     """Each event after one, as it comes, until no more will. key : the same for all who follow the same.
 
     begins : a number to say first, so that a client that lost the connection before the first event can go on.
+    keepalive_s : after so much silence a comment is sent.
     """
     shared = open_looks.setdefault(key, SharedLooks(followed))
     news = shared.join()
@@ -357,15 +359,19 @@ async def told(
         after = min(after, await run_in_threadpool(shared.last))
         over = False
         if begins is not None:
-            yield ServerSentEvent(id=str(begins), sep="\n")
+            yield format_sse_event(id=str(begins))
         while not over:
             news.clear()
             events, over = await shared.look(after)
             for event in events:
                 after = event.number
-                yield ServerSentEvent(json.dumps(_data(event)), event=event.kind, id=str(after), sep="\n")
-            if not over and (shared.most is None or len(events) < shared.most):
-                await news.wait()
+                yield format_sse_event(data_str=json.dumps(_data(event)), event=event.kind, id=str(after))
+            while not (over or news.is_set()) and (shared.most is None or len(events) < shared.most):
+                try:
+                    async with asyncio.timeout(keepalive_s):
+                        await news.wait()
+                except TimeoutError:
+                    yield KEEPALIVE_COMMENT
     finally:
         shared.leave(news)
         if shared.unused:

@@ -14,8 +14,8 @@ from uuid import uuid4
 
 import pytest
 from fastapi.responses import StreamingResponse
+from fastapi.sse import EventSourceResponse
 from fastapi.testclient import TestClient
-from sse_starlette import EventSourceResponse
 from starlette.types import Receive, Send
 from starlette.types import Scope as ASGIScope
 

@@ -17,7 +17,6 @@ import pytest
 import uvicorn
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
-from sse_starlette import ServerSentEvent
 from starlette.types import Receive, Scope, Send
 
 from slrig.api import server as connections
@@ -79,13 +78,13 @@ class Jobs:
             self.store.progress(job.id, JobProgress("capture", step / 1000, ""))
         return job.id
 
-    def follow(self, after: int = 0, *, most: int = 500) -> AsyncGenerator[ServerSentEvent]:
-        stream = stream_of(self.open, EVERY_JOB, self.followed(most=most), after)
+    def follow(self, after: int = 0, *, most: int = 500) -> AsyncGenerator[bytes]:
+        stream = stream_of(self.open, EVERY_JOB, self.followed(most=most), after, keepalive_s=WAIT_S)
         assert isinstance(stream, AsyncGenerator)
         return stream
 
-    def follow_scan(self, scan: UUID, after: int) -> AsyncIterator[ServerSentEvent]:
-        return stream_of(self.open, scan, followed_job(self.store, scan), after)
+    def follow_scan(self, scan: UUID, after: int) -> AsyncIterator[bytes]:
+        return stream_of(self.open, scan, followed_job(self.store, scan), after, keepalive_s=WAIT_S)
 
     async def looked(self, count: int) -> None:
         async with asyncio.timeout(WAIT_S):
@@ -100,15 +99,23 @@ def jobs(tmp_path: Path) -> Iterator[Jobs]:
     made.store.database.close()
 
 
-async def some(stream: AsyncIterator[ServerSentEvent], count: int) -> list[dict[str, Any]]:
-    async with asyncio.timeout(WAIT_S):
-        found = [await anext(stream) for _ in range(count)]
-    return [{"number": int(each.id or 0), "event": each.event, **json.loads(each.data or "")} for each in found]
+def parts(sent: bytes) -> dict[str, str]:
+    """The fields of an event as it is sent; a comment's is ''."""
+    return dict(line.split(": ", 1) for line in sent.decode().strip().splitlines())
 
 
-async def rest(stream: AsyncIterator[ServerSentEvent]) -> list[str | None]:
+async def some(stream: AsyncIterator[bytes], count: int) -> list[dict[str, Any]]:
+    told: list[dict[str, str]] = []
     async with asyncio.timeout(WAIT_S):
-        return [event.id async for event in stream]
+        while len(told) < count:
+            event = parts(await anext(stream))
+            told += [event] if event.get("id") else []
+    return [{"number": int(each["id"]), "event": each["event"], **json.loads(each["data"])} for each in told]
+
+
+async def rest(stream: AsyncIterator[bytes]) -> list[str | None]:
+    async with asyncio.timeout(WAIT_S):
+        return [parts(event).get("id") async for event in stream]
 
 
 @on_loop
@@ -131,7 +138,7 @@ async def test_stream_of_a_deleted_scan_ends(jobs: Jobs, final: bool) -> None:
     woken: list[bool] = []
     unwatch = jobs.store.watch(scan, lambda: woken.append(True))
     stream = jobs.follow_scan(scan, 0)
-    assert (await anext(stream)).id == "1"
+    assert parts(await anext(stream))["id"] == "1"
     if final:
         # The last event wakes the stream, which then finds the scan gone.
         jobs.store.act = lambda: jobs.store.delete(scan)
@@ -245,9 +252,11 @@ async def test_events_of_a_deleted_job_are_gone_and_others_go_on(jobs: Jobs) -> 
 async def test_client_that_names_no_event_gets_the_number_where_it_begins(jobs: Jobs) -> None:
     jobs.scan(steps=4)
 
-    stream = stream_of(jobs.open, EVERY_JOB, jobs.followed(), 5, begins=5)
+    stream = stream_of(jobs.open, EVERY_JOB, jobs.followed(), 5, begins=5, keepalive_s=0.001)
     async with asyncio.timeout(WAIT_S):
-        assert (await anext(stream)).encode() == b"id: 5\n\n"
+        assert await anext(stream) == b"id: 5\n\n"
+        # In silence the connection is kept by comments.
+        assert await anext(stream) == b": ping\n\n"
     await asyncio.to_thread(jobs.scan)
     assert [each["number"] for each in await some(stream, 1)] == [6]
 
