@@ -22,7 +22,6 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import structlog
-from alembic.util import CommandError
 from sqlalchemy import (
     URL,
     BigInteger,
@@ -227,7 +226,7 @@ class Catalogue:
             if connection.dialect.name == "postgresql":
                 # Rigs that start together wait for one another; the lock ends with the transaction, however that does.
                 connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _LOCK})
-            unknown = upgrade(connection, "slrig.catalogue:versions", CatalogueBase.metadata)
+            unknown = upgrade(connection, CatalogueBase.metadata, {"catalogue1": ()})
         if unknown:
             message = (
                 f"{self.address} was made by another slrig (its tables are of version {unknown}), and this one cannot "
@@ -316,7 +315,7 @@ class Catalogue:
     def _faults(self) -> Iterator[None]:
         try:
             yield
-        except (DBAPIError, NoConnectionError, CommandError, OSError, struct.error) as error:
+        except (DBAPIError, NoConnectionError, OSError, struct.error) as error:
             message = f"The catalogue {self.address} cannot be used: {_cause(error)}."
             raise CatalogueError(message) from error
 

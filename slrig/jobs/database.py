@@ -10,7 +10,7 @@ import random
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,13 +18,10 @@ from typing import Any, TypeVar
 from uuid import UUID, uuid4
 
 import structlog
-from alembic import command
-from alembic.config import Config
-from alembic.migration import MigrationContext
-from alembic.script import ScriptDirectory
 from sqlalchemy import (
     JSON,
     Boolean,
+    Column,
     Connection,
     Engine,
     Float,
@@ -33,10 +30,14 @@ from sqlalchemy import (
     Integer,
     MetaData,
     String,
+    Table,
     UniqueConstraint,
     create_engine,
+    delete,
     event,
+    insert,
     inspect,
+    select,
 )
 from sqlalchemy.engine.interfaces import DBAPIConnection, DBAPICursor
 from sqlalchemy.exc import DatabaseError, OperationalError
@@ -46,6 +47,19 @@ from slrig.bundle import stored_json
 from slrig.errors import InvalidInputError, StorageError
 from slrig.failure import JobFailure, disk_errors
 from slrig.jobs.records import UNREADABLE, JobKind, JobProgress, JobRecord, JobState
+
+CHANGES: Mapping[str, Sequence[str]] = {
+    "records2": (),
+    "records3": ("ALTER TABLE job ADD COLUMN requested_by VARCHAR(80)",),
+    "records4": (
+        "CREATE TABLE notice (number INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, id VARCHAR(36) NOT NULL, "
+        "at VARCHAR(32) NOT NULL, kind VARCHAR(32) NOT NULL, body JSON NOT NULL)",
+    ),
+    "records5": ("ALTER TABLE notice ADD COLUMN receiver VARCHAR(16) DEFAULT 'webhook' NOT NULL",),
+    "records6": (),
+    "records7": ("ALTER TABLE job ADD COLUMN attempts INTEGER DEFAULT '0' NOT NULL",),
+}
+"""See `upgrade`. Databases from before these call their state 0001."""
 
 
 class Base(DeclarativeBase):
@@ -355,7 +369,7 @@ class Database:
             damaged = _put_aside(path, (aside or path.parent) / f"{path.name}-damaged-{uuid4().hex[:8]}")
         self._engine = sqlite_engine(path)
         with self._refusals(), writing(self._engine, PATIENCE_S).begin() as connection:
-            if unknown := upgrade(connection, "slrig.jobs:migrations/versions", Base.metadata):
+            if unknown := upgrade(connection, Base.metadata, CHANGES):
                 message = (
                     f"{path} was written by another version of slrig (its records are of version {unknown}), and this "
                     "one cannot read it. Move that file out of the data folder: finished scans and calibrations are "
@@ -525,17 +539,28 @@ def _begin(connection: Connection) -> None:
     connection.exec_driver_sql("BEGIN" if patience_ms is None else "BEGIN IMMEDIATE")
 
 
-def upgrade(connection: Connection, scripts: str, tables: MetaData) -> str:
-    """Bring tables up to date by Alembic's scripts in `PACKAGE:FOLDER`. Does nothing when they are; changes nothing,
-    and returns the versions that the scripts do not know, where another slrig made them, else "".
+_VERSION = Table("alembic_version", MetaData(), Column("version_num", String(32), primary_key=True))
+"""Of the tables; named as by Alembic, which made them once."""
+
+
+def upgrade(connection: Connection, tables: MetaData, changes: Mapping[str, Sequence[str]]) -> str:
+    """Bring tables up to date. Does nothing when they are; changes nothing, and returns the version that `changes` do
+    not name, where another slrig made them, else "".
+
+    changes : by each version of the tables, old to new, the SQL that makes it of the one before. Tables that it does
+    not name are made as `tables` has them, and in a new database all are.
     """
-    config = Config()
-    config.set_main_option("script_location", "slrig.jobs:migrations")
-    config.set_main_option("version_locations", scripts)
-    config.set_main_option("path_separator", "newline")
-    config.attributes.update(connection=connection, tables=tables)
-    known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
-    unknown = set(MigrationContext.configure(connection).get_current_heads()) - known
-    if not unknown:
-        command.upgrade(config, "head")
-    return ", ".join(sorted(unknown))
+    known = list(changes)
+    there = inspect(connection).has_table(_VERSION.name)
+    found = connection.scalar(select(_VERSION.c.version_num)) if there else None
+    if found is not None and found not in known:
+        return str(found)
+    if found != known[-1]:
+        for version in known[known.index(found) + 1 :] if found is not None else ():
+            for statement in changes[version]:
+                connection.exec_driver_sql(statement)
+        tables.create_all(connection)
+        _VERSION.create(connection, checkfirst=True)
+        connection.execute(delete(_VERSION))
+        connection.execute(insert(_VERSION).values(version_num=known[-1]))
+    return ""

@@ -35,8 +35,8 @@ try: import fcntl
 except ImportError: assert not hasattr(signal, "SIGHUP")
 own = [each.name for package in (slrig, drivers, simulated_rig)
        for each in pkgutil.walk_packages(package.__path__, package.__name__ + ".")]
-# Run by themselves: by Alembic, by python -m, and on a microcontroller.
-apart = (".migrations.env", ".__main__", "device.main", "device.box")
+# Run by themselves: by python -m, and on a microcontroller.
+apart = (".__main__", "device.main", "device.box")
 own = [name for name in own if not name.endswith(apart)]
 print(len([importlib.import_module(name) for name in own]))
 """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import datetime, timedelta, timezone
 from importlib.metadata import version
 from pathlib import Path
@@ -337,6 +337,30 @@ def test_migrations_give_the_tables_that_the_code_uses(path: Path) -> None:
     with engine.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
         assert connection.execute(text("PRAGMA journal_mode")).scalar() == "wal"
+    engine.dispose()
+
+
+@pytest.mark.parametrize(("version", "undone"), [
+    ("records2", ["DROP TABLE notice", "ALTER TABLE job DROP COLUMN requested_by", "DROP TABLE audit"]),
+    ("records4", ["ALTER TABLE notice DROP COLUMN receiver"]),
+])  # fmt: skip
+def test_tables_of_an_earlier_version_become_todays_and_keep_their_rows(
+    path: Path, version: str, undone: Sequence[str]
+) -> None:
+    database = Database(path)
+    kept = JobStore(database).create({}, kind=JobKind.SCAN, rig="bench", label="kept").id
+    database.close()
+    with sqlite3.connect(path) as file:
+        for statement in (*undone, "DROP TABLE job_copy", "ALTER TABLE job DROP COLUMN attempts"):
+            file.execute(statement)
+        file.execute("UPDATE alembic_version SET version_num = ?", [version])
+    file.close()
+    database = Database(path)
+    assert [record.id for record in JobStore(database).page(before=None, limit=10)] == [kept]
+    database.close()
+    engine = create_engine(f"sqlite:///{path}")
+    with engine.connect() as connection:
+        assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
     engine.dispose()
 
 

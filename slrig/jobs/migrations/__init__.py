@@ -1,1 +1,0 @@
-"""Changes of the database's tables, in order: one chain, run at every start of the service."""

@@ -1,1 +1,0 @@
-"""One module per change, each naming the one before it."""
