@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 from urllib.parse import urlencode
@@ -17,6 +18,7 @@ from slrig.cli.options import (
     Keys,
     RigOption,
     ServiceOptions,
+    SubjectsCommand,
     Unit,
     by_beginning,
     given,
@@ -71,7 +73,7 @@ def board(
     write_board(chosen_board(asked), output, page=page)
 
 
-@app.command()
+@app.command(cls=SubjectsCommand)
 @grouped
 def solve(
     folder: Annotated[
@@ -110,8 +112,14 @@ def solve(
     )
 
 
-@app.command()
-@grouped
+@app.command(cls=SubjectsCommand)
+@partial(
+    grouped,
+    subjects={
+        "Board": "board_shape", "Session": "resume label cameras_alone exposure_s",
+        "By the rig's positioner": "scripted position activate", "Service": "rig data",
+    },
+)  # fmt: skip
 def run(
     *,
     asked: BoardArguments,

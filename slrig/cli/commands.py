@@ -12,6 +12,7 @@ import sys
 from collections.abc import Mapping
 from copy import copy
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -33,6 +34,7 @@ from slrig.cli.options import (
     RigOption,
     ScanOptions,
     ServiceOptions,
+    SubjectsCommand,
     Unit,
     given,
     grouped,
@@ -273,6 +275,7 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
+    context_settings={"max_content_width": 120},
     help="Structured-light scanning: from a projector and cameras to a triangle mesh in millimetres.",
     epilog="Start with: slrig demo",
 )
@@ -317,12 +320,20 @@ def demo(
     run_demo(rig, output, data, show=show)
 
 
-@app.command()
-@grouped
+@app.command(cls=SubjectsCommand)
+@partial(
+    grouped,
+    subjects={
+        "Object and files": "label turn_deg manual output file force",
+        "Light and colour": "exposure_s",
+        "Patterns": "sequence period_px steps line_width_px gray_cell_px gray_only rows cross_lines",
+        "When": "queue repeat every_s",
+        "Service": "rig",
+    },
+)
 def scan(
     *,
-    service: ServiceOptions,
-    rig: RigOption = None,
+    label: Annotated[str | None, typer.Option(help="Free text, to find the scan again.")] = None,
     output: Annotated[
         Path | None, typer.Option(help="Folder for the files of the scan. Default: of its time, within scans.")
     ] = None,
@@ -333,7 +344,8 @@ def scan(
             "Default: mesh.ply, preview.png, report.json."
         ),
     ] = None,
-    label: Annotated[str | None, typer.Option(help="Free text, to find the scan again.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite files of an earlier scan in --output.")] = False,
+    asked: ScanOptions,
     exposure_s: Annotated[
         list[float] | None,
         typer.Option(help="Exposure of every camera, seconds; repeated, a bracket for what is dark here, shiny there."),
@@ -359,12 +371,12 @@ def scan(
         bool,
         typer.Option("--cross-lines", help="Play one frame of lines along the other axis: it tests the calibration."),
     ] = False,
-    asked: ScanOptions,
     mesh: MeshOptions,
     queue: Annotated[bool, typer.Option("--queue", help="Wait in line if the rig is held.")] = False,
     repeat: Annotated[int, typer.Option(min=1, help="So many scans in a row, each into a folder of its number.")] = 1,
     every_s: Annotated[float | None, typer.Option(help="From the start of one to that of the next, seconds.")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite files of an earlier scan in --output.")] = False,
+    service: ServiceOptions,
+    rig: RigOption = None,
 ) -> None:
     """Scan with a running service, and fetch the mesh."""
     from slrig.cli.scan import FILES, assisted, client_of, refuse_earlier, scan_with, series_with, tell_result
@@ -401,7 +413,7 @@ def scan(
     tell_result(result, output, files=files)
 
 
-@app.command()
+@app.command(cls=SubjectsCommand)
 @grouped
 def reconstruct(
     *,
@@ -624,8 +636,15 @@ def verify(
         raise typer.Exit(1)
 
 
-@app.command()
-@grouped
+@app.command(cls=SubjectsCommand)
+@partial(
+    grouped,
+    subjects={
+        "Limits": "tolerance_mm spacing_limit_mm form_limit_mm size_limit_mm flatness_limit_mm",
+        "Captures": "scripted volume_mm repeats exposure_s",
+        "Report": "output as_json certificate notes",
+    },
+)
 def accept(
     *,
     rig: RigFile,
@@ -702,9 +721,17 @@ def delete(name: Name, service: ServiceOptions) -> None:
 
 app.command()(serve)
 app.command()(live)
-app.command()(model)
+app.command(cls=SubjectsCommand)(model)
 app.command()(patterns)
-app.command(name="import")(import_images)
+app.command(name="import", cls=SubjectsCommand)(
+    grouped(
+        import_images,
+        subjects={
+            "What the images show": "projector program pattern names white black listed cell_px offset_px",
+            "Cameras and calibration": "camera bit_depth calibration unit keys",
+        },
+    )
+)
 app.command()(backup)
 app.command()(check)
 app.command()(restore)

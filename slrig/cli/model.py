@@ -8,12 +8,13 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slrig.cli.options import BoardArguments, ServiceOptions, given, grouped
+from slrig.cli.options import BoardArguments, ServiceOptions, SubjectsCommand, given, grouped
 from slrig.errors import ConfigError
 from slrig.examples import rig_path
 from slrig.jobs.listener import Listener
@@ -29,7 +30,14 @@ apart.
 """
 
 
-@grouped
+@partial(
+    grouped,
+    subjects={
+        "Where the views belong": "angle axis axis_point axis_direction turntable poses unknown markers dictionary",
+        "Shooting": "shoot rig manual",
+        "Surface": "no_cut start_error_mm voxel_mm",
+    },
+)
 def model(
     *,
     scans: Annotated[
@@ -353,7 +361,7 @@ def _named_meshes(asked: Sequence[Path]) -> dict[str, Path]:
 turntable_app = typer.Typer(no_args_is_help=True, help="A turntable's axis, its plate and what is behind.")
 
 
-@turntable_app.command()
+@turntable_app.command(cls=SubjectsCommand)
 @grouped
 def shoot(
     *,

@@ -5,11 +5,13 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_type_hints
 
 import typer
+import typer.core
 
 from slrig import KEY_VARIABLE
 from slrig.errors import ConfigError, SlrigError
@@ -17,6 +19,31 @@ from slrig.examples import rig_path
 
 if TYPE_CHECKING:
     from slrig.client import Client
+
+_NAMES = 30
+"""Width of the column of options' names; longer ones stand on a line of their own."""
+
+
+class SubjectsCommand(typer.core.TyperCommand):
+    """A command of many options: its help has a heading for each subject (`rich_help_panel`)."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write arguments, options without a subject, then the others subject by subject."""
+        subjects: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
+        for each in self.get_params(ctx):
+            words = each.get_help_record(ctx)
+            subject = getattr(each, "rich_help_panel", None) or "Options"
+            if words is not None:
+                named = "Arguments" if each.param_type_name == "argument" else subject
+                subjects.setdefault(named, []).append(words)
+        if len(subjects["Options"]) == 1:
+            subjects["Help"] = subjects.pop("Options")
+        widest = min(_NAMES, max(len(name) for rows in subjects.values() for name, _ in rows))
+        for subject, rows in subjects.items():
+            if rows:
+                with formatter.section(subject):
+                    formatter.write_dl([(name.ljust(widest), words) for name, words in rows], _NAMES)
+
 
 RigFile = Annotated[
     Path, typer.Argument(metavar="RIG", callback=rig_path, help="Rig file, or the name of an example, such as demo.")
@@ -57,6 +84,8 @@ Keys = Annotated[
 class ServiceOptions:
     """Where a running service is, and its key."""
 
+    subject: ClassVar = "Service"
+
     url: Annotated[str, typer.Option(envvar="SLRIG_URL", help="Where the service is.")] = "http://127.0.0.1:8731"
     key_file: Annotated[
         Path | None,
@@ -86,6 +115,8 @@ def _read_key(file: Path) -> str:
 @dataclass(frozen=True, slots=True)
 class BoardArguments:
     """A calibration board as far as the command line names it."""
+
+    subject: ClassVar = "Board"
 
     kind: Annotated[
         Literal["charuco", "chessboard", "circles"] | None,
@@ -120,6 +151,8 @@ class BoardArguments:
 @dataclass(frozen=True, slots=True)
 class MeshOptions:
     """How a mesh is made, as far as the command line says it."""
+
+    subject: ClassVar = "Mesh"
 
     keep_holes: Annotated[
         bool | None,
@@ -174,6 +207,8 @@ class MeshOptions:
 @dataclass(frozen=True, slots=True)
 class AcceptanceOptions:
     """What the command line says of artefacts and limits; None where it says nothing. Lengths in mm."""
+
+    subject: ClassVar = "Artefacts"
 
     sphere_mm: Annotated[
         tuple[float, float] | None,
@@ -255,23 +290,27 @@ class AcceptanceOptions:
     notes: Annotated[str, typer.Option(help="Free text for the report.")] = ""
 
 
-def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """A command as typer reads it: an option for each field of a parameter that is a dataclass."""
+def grouped(command: Callable[..., None], *, subjects: Mapping[str, str] | None = None) -> Callable[..., None]:
+    """A command as typer reads it: an option for each field of a parameter that is a dataclass.
+
+    subjects : names of options by the subject under which `SubjectsCommand` lists them; others have the `subject` of
+    their class.
+    """
     parameters = []
+    named = {name: subject for subject, names in (subjects or {}).items() for name in names.split()}
     groups: dict[str, type] = {}
     hints = get_type_hints(command, include_extras=True)
     for name, parameter in inspect.signature(command).parameters.items():
         if not is_dataclass(hints[name]):
-            parameters.append(parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY))
+            told = _under(named.get(name), hints[name])
+            parameters.append(parameter.replace(annotation=told, kind=inspect.Parameter.KEYWORD_ONLY))
             continue
         groups[name] = hints[name]
         options = get_type_hints(hints[name], include_extras=True)
-        parameters += [
-            inspect.Parameter(
-                each.name, inspect.Parameter.KEYWORD_ONLY, default=each.default, annotation=options[each.name]
-            )
-            for each in fields(hints[name])
-        ]
+        for each in fields(hints[name]):
+            told = _under(named.get(each.name, hints[name].subject), options[each.name])
+            kind = inspect.Parameter.KEYWORD_ONLY
+            parameters.append(inspect.Parameter(each.name, kind, default=each.default, annotation=told))
 
     @functools.wraps(command)
     def flat(**told: Any) -> None:
@@ -282,6 +321,15 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 
     flat.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     return flat
+
+
+def _under(subject: str | None, option: Any) -> Any:
+    """The type of an option, with the subject under which help lists it."""
+    if subject is None:
+        return option
+    words = copy(option.__metadata__[0])
+    words.rich_help_panel = subject
+    return Annotated[option.__origin__, words]
 
 
 def given(**options: object) -> dict[str, object]:
@@ -313,7 +361,9 @@ def by_beginning(
 
 @dataclass(frozen=True, slots=True)
 class ScanOptions:
-    """What the command line says of the object, of its stage and of colour; None where it says nothing."""
+    """What the command line says of the object, of its light and of colour; None where it says nothing."""
+
+    subject: ClassVar = "Light and colour"
 
     preset: Annotated[str | None, typer.Option(help="Options by name: see slrig preset list.")] = None
     assist: Annotated[

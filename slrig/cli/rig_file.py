@@ -474,6 +474,7 @@ def _tell(projector: RigFileTable, cameras: Sequence[RigFileTable], output: Path
     )
     for number, (command, why) in enumerate(steps, 1):
         typer.echo(f"  {number}. {command}\n     {why}")
+    typer.echo("To have Tab complete commands and options in this shell: slrig --install-completion")
 
 
 def _properties(driver: str) -> Mapping[str, Any]:

@@ -60,6 +60,7 @@ from tests.unit.client.service import SCAN, Walk, client_of, failing
 from tests.unit.command import done, refused, slrig
 
 COLUMNS = 80
+MOST_OPTIONS = 12
 DEMO = EXAMPLES / "rigs" / "demo.toml"
 SUMMARY = {
     "identity": "28/28 patterns verified, 2 frames shot again",
@@ -95,6 +96,10 @@ def test_help_of_each_command_fits_a_terminal_of_80_columns() -> None:
         # And no text stands in a strip of a few words.
         indents = [len(line) - len(line.lstrip()) for line in lines if line.startswith("   ")]
         assert max(indents, default=0) <= COLUMNS // 2, words
+        # Many options stand under headings of their subjects.
+        options = re.findall(r"^  --|^\w.*:$", "\n".join(lines), re.MULTILINE)
+        lists = "".join("-" if each == "  --" else "/" for each in options).split("/")
+        assert max(map(len, lists), default=0) <= MOST_OPTIONS, words
 
 
 def test_help_and_version_load_nothing_heavy() -> None:

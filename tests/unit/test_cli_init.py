@@ -78,7 +78,13 @@ def test_two_webcams_and_a_screen_lead_to_a_rig_file(bench: Bench) -> None:
     assert "# HD Pro Webcam C920 (/dev/video2)\n" in text
     assert "# Whole refresh periods of a video projector" in text
     assert max(map(len, text.splitlines())) <= 80
-    for command in (f"slrig doctor {bench.path}", "slrig serve", "slrig calibrate run", "slrig scan"):
+    for command in (
+        f"slrig doctor {bench.path}",
+        "slrig serve",
+        "slrig calibrate run",
+        "slrig scan",
+        "slrig --install-completion",
+    ):
         assert command in shown
 
 
