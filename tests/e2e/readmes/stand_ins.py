@@ -45,7 +45,7 @@ INIT_NAMED = (
 
 STAND_INS = (
     StandIn(
-        "python3 -m venv .venv && .venv/bin/pip install -q -e . && .venv/bin/slrig demo",
+        "python3 -m venv .venv && .venv/bin/pip install -q --no-compile -e . && .venv/bin/slrig demo",
         ".venv/bin/slrig demo",
         ".ci/run makes an environment of its own by the same two commands, and this test runs in it",
     ),
