@@ -191,10 +191,8 @@ def test_a_program_of_ros_scans_cancels_and_reads_what_was_published(python: str
 
             # Live depth begins with who subscribes to it.
             with running(python, tmp_path / "live.log", str(PEER)) as viewer:
-                path = str(tmp_path / "live")
-                viewer.do(
-                    "read", topic="/slrig/left/live", kind=LATCHED["/slrig/left/points"], path=path, latched=False
-                )
+                path, cloud_kind = str(tmp_path / "live"), LATCHED["/slrig/left/points"]
+                viewer.do("read", topic="/slrig/left/live", kind=cloud_kind, path=path, latched=False)
                 viewer.hear("/slrig/left/live")
             shown = store.deserialize_cdr(Path(path).read_bytes(), cloud_kind)
             assert (shown.header.frame_id, shown.width, shown.height) == ("left_optical_frame", 80, 64)
