@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -44,6 +46,7 @@ from slrig.kernels import report_compilations
 from slrig.model import Calibration, PatternSequence, Primary, Surface, Truth
 
 NAME = "projector"
+_REPEAT_S = 10.0
 CHANNELS = ("blue", "green", "red")
 
 
@@ -280,8 +283,10 @@ class SimulatedHead:
 
     def prepare(self) -> None:
         """Compile kernels and trace the light of the current scene, reporting progress."""
-        tell = progress_reporter()
-        with report_compilations(lambda kernel: tell(f"preparing kernels, first time only: {kernel}")):
+        with (
+            _repeating(progress_reporter()) as tell,
+            report_compilations(lambda kernel: tell(f"preparing kernels, first time only: {kernel}")),
+        ):
             for name, view in self._views.items():
                 view.prepare(report_progress=partial(_report_tracing, tell, name))
 
@@ -302,6 +307,28 @@ class SimulatedHead:
         ):
             known = self._truth = Truth(Surface(shape.vertices_mm, shape.faces), cameras)
         return known
+
+
+@contextmanager
+def _repeating(report: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
+    """Repeat the last report while the block runs: on a slow computer one kernel compiles for longer than a device may
+    be silent.
+    """
+    last, over = [""], threading.Event()
+
+    def tell(text: str) -> None:
+        last[0] = text
+        report(text)
+
+    def repeat() -> None:
+        while not over.wait(_REPEAT_S):
+            report(last[0])
+
+    threading.Thread(target=repeat, name="slrig-preparing", daemon=True).start()
+    try:
+        yield tell
+    finally:
+        over.set()
 
 
 def _report_tracing(tell: Callable[[str], None], camera: str, share: float) -> None:
