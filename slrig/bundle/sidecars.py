@@ -8,6 +8,7 @@ that is 0.06 micrometres, far below any measurement.
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,6 +42,23 @@ TURNTABLE_MAX_BYTES = 2**16
 SURFACE_FILE = "truth.ply"
 VISIBLE_POINTS_FILE = "visible_points.npy"
 TRUTH_MAPS_FILE = "truth-{camera}.npz"
+_SURFACE_HEAD = """ply
+format binary_little_endian 1.0
+element vertex {vertices}
+property float x
+property float y
+property float z
+element face {triangles}
+property list uchar int vertex_indices
+end_header
+"""
+_SURFACE_PATTERN = re.compile(
+    _SURFACE_HEAD.replace("1.0\n", r"1\.0\n(?:comment .*\n)*")
+    .replace("{vertices}", r"(?P<vertices>\d{1,10})")
+    .replace("{triangles}", r"(?P<triangles>\d{1,10})")
+    .encode()
+)
+_TRIANGLE = np.dtype([("count", "u1"), ("corners", "<i4", (3,))])
 
 
 def write_health(folder: Path, stamp: Mapping[str, Any]) -> None:
@@ -182,10 +200,7 @@ class BundleTruth:
 
 def write_truth(folder: Path, truth: Truth) -> None:
     """Write the truth into a bundle's folder, each file completely or not at all. Raises StorageError."""
-    import trimesh
-
-    mesh = trimesh.Trimesh(truth.surface.vertices_mm, truth.surface.faces, process=False)
-    write_file(folder / SURFACE_FILE, mesh.export(file_type="ply", vertex_normal=False))
+    write_file(folder / SURFACE_FILE, _surface_bytes(truth.surface))
     first = next(iter(truth.cameras.values()))
     data = io.BytesIO()
     np.save(data, first.visible_points_mm, allow_pickle=False)
@@ -207,13 +222,9 @@ def read_truth(folder: Path) -> BundleTruth | None:
     """
     if not (folder / SURFACE_FILE).exists() and not (folder / VISIBLE_POINTS_FILE).exists():
         return None
-    # Takes a second to import, and no live scan has truth.
-    import trimesh
-
     path = folder / SURFACE_FILE
     try:
-        mesh = trimesh.load_mesh(path, process=False)
-        surface = Surface(np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int32))
+        surface = _surface(path.read_bytes())
         path = folder / VISIBLE_POINTS_FILE
         visible = _points(read_arrays(path, _MAX_TRUTH_BYTES)[""])
         cameras = {}
@@ -228,6 +239,29 @@ def read_truth(folder: Path) -> BundleTruth | None:
         message = f"{path}: expected truth of the bundle, found: {cause}; render the scene again"
         raise BundleError(message) from cause
     return BundleTruth(surface, visible, cameras)
+
+
+def _surface_bytes(surface: Surface) -> bytes:
+    """A PLY file with a surface."""
+    triangles = np.zeros(len(surface.faces), _TRIANGLE)
+    triangles["count"], triangles["corners"] = 3, surface.faces
+    head = _SURFACE_HEAD.format(vertices=len(surface.vertices_mm), triangles=len(triangles))
+    return head.encode() + surface.vertices_mm.astype("<f4").tobytes() + triangles.tobytes()
+
+
+def _surface(ply: bytes) -> Surface:
+    """The surface in a PLY file as `_surface_bytes` makes it. Raises ValueError."""
+    head = _SURFACE_PATTERN.match(ply)
+    if head is None:
+        message = "another PLY file than slrig writes"
+        raise ValueError(message)
+    vertex_count, count = int(head["vertices"]), int(head["triangles"])
+    vertices = np.frombuffer(ply, "<f4", 3 * vertex_count, head.end()).reshape(-1, 3)
+    triangles = np.frombuffer(ply, _TRIANGLE, count, head.end() + vertices.nbytes)
+    if (triangles["count"] != 3).any() or (triangles["corners"].astype(np.uint32) >= vertex_count).any():
+        message = "faces that are no triangles of its vertices"
+        raise ValueError(message)
+    return Surface(vertices.astype(np.float64), triangles["corners"].astype(np.int32))
 
 
 def _points(array: FloatArray) -> FloatArray:

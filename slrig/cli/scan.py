@@ -28,8 +28,6 @@ from slrig.disk import storage_errors
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
 from slrig.examples import example_names, is_example
 from slrig.jobs.listener import Listener
-from slrig.scan.artefacts import truth_notes
-from slrig.scan.formats import camera_prefixes, installed_by, offered
 
 _HEADS = ("scan", Column("triangles", justify="right"), Column("σ mm", justify="right"), "")
 _DIGITS = 3
@@ -160,6 +158,8 @@ def _completed(
         raise
     missing = [name for name in files if name not in result.files]
     if missing:
+        from slrig.scan.formats import installed_by
+
         message = f"The scan has no {', '.join(missing)}. It has: {', '.join(result.files)}."
         for name in missing:
             if (command := installed_by(name)) is not None:
@@ -185,6 +185,11 @@ def refuse_earlier(output: Path, files: Sequence[str], *, force: bool) -> None:
 
 def _require_offered(client: Client, files: Sequence[str]) -> None:
     """Refuse names that no scan has before minutes are spent on one."""
+    if set(files) <= set(FILES):
+        return
+    # numpy and all that describes bundles: half a second.
+    from slrig.scan.formats import camera_prefixes, offered
+
     unknown, cameras = [name for name in files if name not in offered(())], []
     if unknown and all(name.startswith(camera_prefixes()) for name in unknown):
         # A file per camera: which there are is known once the rig is open.
@@ -209,6 +214,8 @@ def tell_result(scan: Mapping[str, Any], output: Path, *, files: tuple[str, ...]
 START_LIMIT_S = 120.0
 STOP_LIMIT_S = 10.0
 _POLL_S = 0.05
+_READY_POLL_S = 0.2
+"""Each answer takes some milliseconds of the service's time, which opens the rig meanwhile."""
 _OPENING_SHARE, _SERVICE_SHARE = 0.15, 0.5
 """Of a demonstration's time: until the service has started, and until the rig is rendered and open."""
 LABEL = "demo"
@@ -289,6 +296,8 @@ def client_of(rig: Path | None, service: ServiceOptions, data: Path | None = Non
 
 def require_sound(scan: Mapping[str, Any]) -> None:
     """End with exit code 1 if the mesh is not the surface that is known to be there. Its notes say what is wrong."""
+    from slrig.scan.artefacts import truth_notes
+
     if truth_notes((scan.get("summary") or {}).get("truth") or {}):
         raise typer.Exit(1)
 
@@ -344,7 +353,7 @@ def _await_ready(process: subprocess.Popen[bytes], client: Client, data: Path, d
             told, deadline = missing, time.monotonic() + START_LIMIT_S
             display("opening the rig", _OPENING_SHARE, missing)
         _require_alive(process, data, deadline)
-        time.sleep(_POLL_S)
+        time.sleep(_READY_POLL_S)
 
 
 def still_missing(client: Client) -> str | None:

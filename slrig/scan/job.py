@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 from uuid import UUID, uuid4
 
 from pydantic import TypeAdapter
@@ -15,14 +15,17 @@ from slrig.disk import storage_errors
 from slrig.errors import JobNotFoundError, NotCalibratedError
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.job import Job, JobRun, Outcome, Recording
-from slrig.jobs.manager import JobManager
 from slrig.jobs.records import JobKind, JobRecord, utc_now
-from slrig.jobs.store import JobStore
 from slrig.model import Region
 from slrig.rig.session import RigSession
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.artefacts import MESH, REPORT, report_summary
 from slrig.scan.plan import ScanPlan, check_plan, series_of
+
+if TYPE_CHECKING:
+    # The worker, which loads this for its first scan, has no database.
+    from slrig.jobs.manager import JobManager
+    from slrig.jobs.store import JobStore
 
 _plan_adapter = TypeAdapter(ScanPlan)
 

@@ -7,7 +7,7 @@ import json
 import os
 import resource
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -216,6 +216,23 @@ def test_cut_truth_is_refused(tmp_path: Path, name: str, kept: float) -> None:
     data = (tmp_path / name).read_bytes()
     (tmp_path / name).write_bytes(data[: int(kept * len(data))])
     with pytest.raises(BundleError, match=rf"{name}: expected truth"):
+        read_truth(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (lambda ply: ply.replace(b"binary_little_endian", b"ascii"), "another PLY file"),
+        (lambda ply: ply[:-4] + b"\xff\xff\xff\x7f", "no triangles of its vertices"),
+        (lambda ply: ply[:-13] + b"\x04" + ply[-12:], "no triangles of its vertices"),
+    ],
+)
+def test_a_surface_that_slrig_did_not_write_is_refused(
+    tmp_path: Path, change: Callable[[bytes], bytes], cause: str
+) -> None:
+    write_truth(tmp_path, _truth())
+    (tmp_path / "truth.ply").write_bytes(change((tmp_path / "truth.ply").read_bytes()))
+    with pytest.raises(BundleError, match=f"expected truth of the bundle, found: .*{cause}"):
         read_truth(tmp_path)
 
 
