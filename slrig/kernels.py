@@ -248,9 +248,11 @@ class _KernelCache(FunctionCache):  # type: ignore[misc] # numba is untyped
         return bool(self._cache_file.is_cached())
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Save compiled code. If the disk refuses, the next start compiles again, but nothing fails."""
+        """Save compiled code, without the text of the inferred types: a third of the bytes, with the folder of the
+        source. If the disk refuses, the next start compiles again, but nothing fails.
+        """
         try:
-            super().save_overload(sig, data)
+            super().save_overload(sig, data._replace(type_annotation=""))
         except OSError as error:
             _log.warning("a compiled kernel cannot be kept", path=self.cache_path, cause=str(error))
 

@@ -20,8 +20,12 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(best_cpu_level() is None, rea
 
 
 class Installed(NamedTuple):
-    """An environment with the wheel alone. program : its `slrig`; cache : where a compiled kernel would be kept."""
+    """An environment with the wheel alone. wheel : built from `checkout`. program : its `slrig`; cache : where a
+    compiled kernel would be kept.
+    """
 
+    checkout: Path
+    wheel: Path
     program: Path
     folder: Path
     cache: Path
@@ -62,7 +66,22 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     folder.mkdir()
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "SLRIG", "NUMBA"))}
     own = {"HOME": str(root / "home"), "NUMBA_CACHE_DIR": str(cache), "SLRIG_MIN_FREE_BYTES": "0"}
-    return Installed(root / "venv" / "bin" / "slrig", folder, cache, kept | own)
+    return Installed(copy, wheel, root / "venv" / "bin" / "slrig", folder, cache, kept | own)
+
+
+_BUILD_AGAIN = "import sys, wheel; from pathlib import Path; wheel.build(Path(sys.argv[1]))"
+
+
+def test_the_same_files_make_the_same_wheel_at_another_time_with_other_permissions(
+    installed: Installed, tmp_path: Path
+) -> None:
+    for each in (installed.checkout / "slrig").rglob("*.*"):
+        os.utime(each, (1e9, 1e9))
+        each.chmod(0o600)
+    environment = os.environ | {"PYTHONPATH": str(installed.checkout / "config" / "deploy"), "TZ": "Asia/Tokyo"}
+    command = [sys.executable, "-c", _BUILD_AGAIN, tmp_path]
+    subprocess.run(command, check=True, env=environment, umask=0o077)  # noqa: S603 - our own
+    assert (tmp_path / installed.wheel.name).read_bytes() == installed.wheel.read_bytes()
 
 
 def test_the_demonstration_compiles_nothing_and_makes_the_same_mesh_as_the_checkout(

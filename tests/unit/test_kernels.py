@@ -34,6 +34,7 @@ from slrig.kernels import (
     why_compiled,
 )
 
+ROOT = Path(__file__).resolve().parents[2]
 _ADDS = """
 from slrig.kernels import kernel, kernel_part
 
@@ -43,6 +44,8 @@ def more(value):
 
 @kernel(in_every_scan=False)
 def sums(values):
+    if len(values) == 0:
+        raise ValueError("nothing")
     total = values[0] * 0
     for i in range(len(values)):
         total += more(values[i])
@@ -203,6 +206,40 @@ def test_a_kernel_that_came_in_the_wheel_is_not_compiled(shipping: Path, monkeyp
     changed = made(shipping, added=10)
     assert compiled_by(lambda: changed.sums(values)) == ["sums", "more"]
     assert changed.sums(values) == 23
+
+
+_COMPILE = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+import wheel
+wheel.compile_kernels(Path(), "x86-64-v2", Path())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the level is one of x86-64")
+def test_kernels_of_a_wheel_are_the_same_bytes_in_whatever_folder_and_order_they_were_called(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    orders = {"here": (np.float64, np.int64), "somewhere/else": (np.int64, np.float64)}
+    compiling = []
+    for name, kinds in orders.items():
+        folder = tmp_path / name
+        folder.mkdir(parents=True)
+        adding = made(folder, added=1)
+        # numba names the module in what it keeps only if it can be imported.
+        monkeypatch.setitem(sys.modules, "adding", adding)
+        for kind in kinds:
+            adding.sums(np.array([1, 2], kind))
+        search = {"PYTHONPATH": f"{folder}:{ROOT}", "PYTHONHASHSEED": "0", "NUMBA_CPU_FEATURES": ""}
+        command = [sys.executable, "-c", _COMPILE, str(ROOT / "config" / "deploy")]
+        compiling.append(subprocess.Popen(command, cwd=folder, env=os.environ | search))  # noqa: S603 - our own
+    assert [each.wait(timeout=300) for each in compiling] == [0, 0]
+    first, second = (next((tmp_path / name).glob("*.zip")) for name in orders)
+    assert len(zipfile.ZipFile(first).namelist()) == 4
+    assert first.read_bytes() == second.read_bytes()
+    assert str(tmp_path).encode() not in b"".join(map(zipfile.ZipFile(first).read, zipfile.ZipFile(first).namelist()))
 
 
 @pytest.mark.parametrize("kind", ["cut", "flipped", "none", "other versions"])
