@@ -79,7 +79,7 @@ def test_the_same_files_make_the_same_wheel_at_another_time_with_other_permissio
         os.utime(each, (1e9, 1e9))
         each.chmod(0o600)
     environment = os.environ | {"PYTHONPATH": str(installed.checkout / "config" / "deploy"), "TZ": "Asia/Tokyo"}
-    command = [sys.executable, "-c", _BUILD_AGAIN, tmp_path]
+    command: list[str | Path] = [sys.executable, "-c", _BUILD_AGAIN, tmp_path]
     subprocess.run(command, check=True, env=environment, umask=0o077)  # noqa: S603 - our own
     assert (tmp_path / installed.wheel.name).read_bytes() == installed.wheel.read_bytes()
 
@@ -97,6 +97,12 @@ def test_the_demonstration_compiles_nothing_and_makes_the_same_mesh_as_the_check
     subprocess.run(checkout, check=True, cwd=tmp_path, env=environment)  # noqa: S603 - our own
     mesh = installed.folder / "scans" / "demo" / "mesh.ply"
     assert (tmp_path / "mesh.ply").read_bytes() == mesh.read_bytes()
+
+
+def test_a_calibration_compiles_nothing(installed: Installed, tmp_path: Path) -> None:
+    rig = ("--rig", "rendered-calibration-small", "--data", tmp_path / "data")
+    assert "8 used of 8" in installed.run("calibrate", "run", "--scripted", *rig).stdout
+    assert not [*installed.cache.rglob("*.nbc")]
 
 
 def test_an_example_is_written_and_served_with_the_page(installed: Installed, tmp_path: Path) -> None:
