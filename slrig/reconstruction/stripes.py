@@ -298,7 +298,10 @@ def _newton_kernel(
     height, width = image.shape
     radius = int(np.ceil(_SUPPORT * sigma))
     size = 2 * radius + 1
-    whole = np.exp(-((np.arange(size) - radius) ** 2) / (2 * sigma * sigma))
+    # One by one: numba names an expression of arrays by its address, and the machine code would differ each time.
+    whole = np.zeros(size)
+    for k in range(size):
+        whole[k] = np.exp(-((k - radius) ** 2) / (2 * sigma * sigma))
     wx = np.zeros((3, size))
     wy = np.zeros((3, size))
     flat = image.reshape(-1)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import NamedTuple
+from zipfile import ZipFile
 
 import httpx2
 import pytest
@@ -82,6 +83,10 @@ def test_the_same_files_make_the_same_wheel_at_another_time_with_other_permissio
     command: list[str | Path] = [sys.executable, "-c", _BUILD_AGAIN, tmp_path]
     subprocess.run(command, check=True, env=environment, umask=0o077)  # noqa: S603 - our own
     assert (tmp_path / installed.wheel.name).read_bytes() == installed.wheel.read_bytes()
+    # numba names an expression of arrays by its address: a kernel with one is another one each time it is compiled.
+    (kernels,) = (installed.checkout / "slrig" / "compiled").glob("*.zip")
+    with ZipFile(kernels) as archive:
+        assert [name for name in archive.namelist() if b"__numba_array_expr" in archive.read(name)] == []
 
 
 def test_the_demonstration_compiles_nothing_and_makes_the_same_mesh_as_the_checkout(
