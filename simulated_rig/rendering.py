@@ -269,6 +269,8 @@ class CameraView:
         paths = self._trace_paths(cache)
         if cache.room is None:
             cache.room = blur_image(paths.albedo * np.float32(self._ambient), self._blur_px)
+        if ambient is None and len(lights) == 1 and np.ndim(lights[0][0]) == 0 and lights[0][0] == 1:
+            return np.asarray(cache.room + self._cached_light(cache, paths, lights[0][1]))
         total = cache.room.copy() if ambient is None else cache.room * ambient
         for fraction, light in lights:
             total += np.asarray(fraction, np.float32) * self._cached_light(cache, paths, light)

@@ -195,6 +195,8 @@ class LiveDecoder:
         self._changes = np.zeros((count, *shape), np.uint8)
         self._changed, self._clipped = np.zeros((2, *shape), np.uint16)
         self._scratch = np.zeros((4, *shape), np.float32)
+        self._floats, self._bytes = np.zeros((2, 2, *shape), np.float32), np.zeros((2, 2, *shape), np.uint8)
+        self._made = 0
         self._earlier: deque[Float32] = deque(maxlen=count)
 
     def add(self, pattern: int, image: Pixels, begin_s: float, end_s: float) -> str | None:
@@ -202,6 +204,8 @@ class LiveDecoder:
         lattice = image[:: self._step, :: self._step]
         if self._frames is None:
             self._frames = np.zeros((len(self.plan.patterns), *lattice.shape), image.dtype)
+            self._few = np.ascontiguousarray(self._frames[:, ::_SAMPLED, ::_SAMPLED])
+            self._lit = np.zeros(self._few.shape[1:], np.bool_)
         cause = self._fault(pattern, lattice)
         if cause is not None and self._refused_in_a_row[pattern] < _MOST_LEFT_OUT:
             self._refused_in_a_row[pattern] += 1
@@ -220,6 +224,7 @@ class LiveDecoder:
             np.float32(self._clipped_at),
             summed, *(np.float32(each) for each in weights), self._total, *sums,
         )  # fmt: skip
+        self._few[pattern] = lattice[::_SAMPLED, ::_SAMPLED]
         self._times[pattern] = begin_s, end_s
         self._seen[pattern] += 1
         if pattern == plan.fine[-1]:
@@ -227,15 +232,16 @@ class LiveDecoder:
         return None
 
     def depth(self) -> DepthImage | None:
-        """Return the depth image of the newest frames; None until each pattern has come twice, and where they
-        contradict one another, as `contradiction` says.
+        """Return the depth image of the newest frames, which holds until the next but one is made; None until each
+        pattern has come twice, and where they contradict one another, as `contradiction` says.
         """
         if self._frames is None or self._noise is None or self._seen.min() < 2:
             return None
         plan, shape = self.plan, self.table.middle.shape
-        depth, sigma = (np.zeros(shape, np.float32) for _ in range(2))
         raw, rough, uncertain, reach = self._scratch
-        grey, state = (np.zeros(shape, np.uint8) for _ in range(2))
+        self._made = 1 - self._made
+        depth, sigma = self._floats[self._made]
+        grey, state = self._bytes[self._made]
         harmonic = np.float32(self._third)
         read, slope = (np.float32(each) for each in self._noise)
         code = plan.patterns[plan.bits[0]] if plan.bits else None
@@ -292,28 +298,28 @@ class LiveDecoder:
 
     def _fault(self, pattern: int, lattice: Pixels) -> str | None:
         """Return why a frame cannot show this pattern, None if nothing speaks against it. Updates the noise."""
-        frames = self._frames
-        if frames is None:
-            return None
-        few = lattice[::_SAMPLED, ::_SAMPLED]
+        few = np.ascontiguousarray(lattice[::_SAMPLED, ::_SAMPLED])
         seen = np.flatnonzero(self._seen)
-        before = {int(k): frames[k, ::_SAMPLED, ::_SAMPLED] for k in seen}
-        for other, image in before.items():
-            if other != pattern and np.array_equal(few, image):
+        for other in seen:
+            if other != pattern and few[0, 0] == self._few[other, 0, 0] and np.array_equal(few, self._few[other]):
                 return f"it is the frame of pattern {other + 1} once more: the camera delivered an old one"
         if pattern == 0 or not self._noise:
             self._spatial = _spatial_variance(lattice)
-        if pattern not in before:
+        if not len(seen):
             return None
-        old = before[pattern].astype(np.float32)
-        new = few.astype(np.float32)
+        if pattern == 0 or not self._noise:
+            # Light that differs between patterns.
+            stack = self._few[seen]
+            self._lit = stack.max(0).astype(np.float32) - stack.min(0) > 2 * _LEAST_MODULATION * self._full_scale
+        if not self._seen[pattern]:
+            return None
+        new, old = few.astype(np.float32), self._few[pattern].astype(np.float32)
         read, slope = self._noise or (self._spatial, 0.0)
-        lit = self._lit(before)
-        same = _same_share(new, old, lit, read, slope)
+        same = _same_share(new, old, self._lit, read, slope)
         if same < _SAME_SHARE:
             others = {
-                k: _same_share(new, each.astype(np.float32), lit, read, slope)
-                for k, each in before.items()
+                k: _same_share(new, self._few[k].astype(np.float32), self._lit, read, slope)
+                for k in map(int, seen)
                 if k != pattern
             }
             nearest = max(others, key=lambda k: others[k], default=pattern)
@@ -322,11 +328,6 @@ class LiveDecoder:
         if pattern == self.plan.fine[0] or self._noise is None:
             self._learn_noise(new, old, self._spatial)
         return None
-
-    def _lit(self, before: dict[int, Pixels]) -> NDArray[np.bool_]:
-        """Samples whose light differs between patterns."""
-        stack = np.stack(list(before.values()))
-        return np.asarray((stack.max(0).astype(np.float32) - stack.min(0)) > 2 * _LEAST_MODULATION * self._full_scale)
 
     def _learn_noise(self, new: Float32, old: Float32, spatial: float) -> None:
         """Fit the variance read + slope · value of a sample to the changes from cycle to cycle.
@@ -398,11 +399,7 @@ class LiveDecoder:
         return (gamma - 1) * (gamma - 2) / ((gamma + 2) * (gamma + 3)) * self._left**8
 
     def _samples(self, index: int) -> Float32:
-        frames = self._frames
-        if frames is None:
-            message = "no frame has come"
-            raise ValueError(message)
-        return np.asarray(frames[index, ::_SAMPLED, ::_SAMPLED], np.float32)
+        return np.asarray(self._few[index], np.float32)
 
     def _blur_px(self) -> float | None:
         if not self.plan.coarse:

@@ -24,7 +24,7 @@ UNWATCHED_S = 10.0
 
 _MOST_POINTS = 1_500_000  # decoded by default
 _RATE_OF = 20  # depth images
-_COMPUTED_PER_S, _GLANCE_S = 25.0, 0.004
+_COMPUTED_PER_S, _GLANCE_S = 21.0, 0.004
 
 _log = structlog.get_logger(__name__)
 
