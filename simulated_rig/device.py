@@ -74,7 +74,7 @@ class SimulatedProjector:
         self.lamp = Lamp(self._dark, swing)
         self._rng = np.random.default_rng((seed, 0x70726F6A))
         self._state = ProjectorState("the simulated projector")
-        self._tables: dict[Pattern, LightTable] = {}
+        self._tables: dict[tuple[Pattern, bytes], LightTable] = {}
         self._shows = 0
         self._shown_pattern: int | None = None
         self._gone = False
@@ -137,17 +137,19 @@ class SimulatedProjector:
         self._shows += 1
         if self._scene_controller is not None:
             self._scene_controller.advance_pattern()
-        pattern = sequence.patterns[index]
-        if pattern not in self._tables:
-            table = self._table(sequence.profiles[index])
+        # A sequence may repeat its patterns, and may show several profiles under one name.
+        pattern, profile = sequence.patterns[index], sequence.profiles[index]
+        key = pattern, profile.tobytes()
+        if key not in self._tables:
+            table = self._table(profile)
             if isinstance(pattern, Primary) and self._options.lights is not None:
                 channel = CHANNELS.index(pattern.colour)
                 table = replace(table, channel=channel, power=self._options.lights[channel])
-            self._tables[pattern] = table
+            self._tables[key] = table
         error_s = self._options.visible_error_s
         t_visible_ns = self._at_refresh(self._clock.now_ns() + nanoseconds(self._options.latency_s))
         off_s = float(self._rng.uniform(-error_s, error_s)) + self._faults.light_delay_s
-        self.lamp.show(self._tables[pattern], at_ns=t_visible_ns + nanoseconds(off_s))
+        self.lamp.show(self._tables[key], at_ns=t_visible_ns + nanoseconds(off_s))
         self._shown_pattern = index
         self._clock.wait_until(t_visible_ns + nanoseconds(error_s), self._state.closed)
         return DisplayedPattern(index, t_visible_ns, nanoseconds(error_s))
