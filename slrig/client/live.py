@@ -28,8 +28,8 @@ class LiveFrame:
     """One depth image. depth_mm, sigma_mm : (h, w) float32, along the camera's axis, NaN where none is known. state :
     (h, w) uint8: 0 measured, 1 moved (its frames do not show one surface, and the depth may be off by `moved_mm` of
     `facts`), 2 saturated, 3 dark, 4 unclear, 5 unseen by camera or projector. grey : (h, w) uint8. directions : (h, w,
-    2) float32, x/z and y/z of each ray in the camera. facts : number, time_s, window_s, shares by state, distance_mm,
-    tilt_deg and more.
+    2) float32, x/z and y/z of each ray in the camera. facts : number, time_s, window_s, age_s (from the arrival of the
+    newest frame to the image), shares by state, distance_mm, tilt_deg and more.
     """
 
     depth_mm: NDArray[np.float32]

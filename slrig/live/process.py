@@ -11,6 +11,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 import traceback
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -45,12 +46,15 @@ class LiveTask:
 
 @dataclass(frozen=True, slots=True)
 class FrameCame:
-    """Parent to child: a frame lies in shared memory. number : counts them; its place is the rest of a division."""
+    """Parent to child: a frame lies in shared memory. number : counts them; its place is the rest of a division.
+    came_s : when, by `time.monotonic`.
+    """
 
     number: int
     pattern: int
     begin_s: float
     end_s: float
+    came_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +118,7 @@ class LiveProcess:
         self._numbers[place] = -1
         self._frames[place] = image
         self._numbers[place] = self._number
-        self._send(FrameCame(self._number, pattern, begin_s, end_s))
+        self._send(FrameCame(self._number, pattern, begin_s, end_s, time.monotonic()))
 
     def want(self, steps: tuple[int, ...]) -> None:
         """Have depth images made for these steps, and no others."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from multiprocessing.connection import Connection
 from typing import Any
@@ -34,6 +35,7 @@ class LiveServer:
         self._steps: tuple[int, ...] = ()
         self._left_out: Counter[str] = Counter()
         self._lost = 0
+        self._came_s = 0.0
 
     def run(self) -> None:
         """Serve until the parent's end of the pipe is gone. Raises EOFError or ConnectionError then."""
@@ -53,6 +55,7 @@ class LiveServer:
             number += 1
             facts = {**depth_facts(image, self._decoder), "number": number, "left_out": sum(self._left_out.values()),
                      "lost": self._lost, "causes": dict(self._left_out.most_common(3))}  # fmt: skip
+            facts["age_s"] = round(time.monotonic() - self._came_s, 4)
             made = {each: depth_message(image, each, self._near_mm, self._unit_mm, facts) for each in self._steps}
             self._pipe.send(DepthCame(number, made, facts))
 
@@ -80,6 +83,7 @@ class LiveServer:
         if self._numbers[place] != message.number:
             self._lost += 1
             return False
+        self._came_s = message.came_s
         cause = self._decoder.add(message.pattern, image, message.begin_s, message.end_s)
         if cause is not None:
             self._left_out[cause] += 1
