@@ -1,0 +1,91 @@
+"""How many depth images a second live depth gives of 1.3 megapixels, what they cost, and how late they are.
+
+    pytest tests/bench/test_live.py -s
+
+A rendered rig without pauses, all rays decoded, one viewer of each third. Processor time is that of service (which
+renders the frames), worker and live process together; the delay is from a frame's arrival to its depth image.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from tests.e2e.conftest import Start
+
+SECONDS = 60.0
+RIG = """
+name = "large"
+[head]
+driver = "simulated"
+scene = "scene.toml"
+ambient = 0.01
+[head.projector]
+size_px = [1280, 800]
+focal_px = [5500.0, 5500.0]
+distortion = [0.03, -0.02, 0.0003, 0.0, 0.0]
+position_mm = [105.0, -10.0, -590.0]
+target_mm = [0.0, 0.0, 0.0]
+blur_px = 0.6
+gamma = 1.8
+[[head.camera]]
+name = "left"
+size_px = [1280, 1024]
+saturation_s = 0.02
+focal_px = [5000.0, 5000.0]
+distortion = [-0.11, 0.15, -0.0003, 0.0005, 0.0]
+position_mm = [-150.0, -12.0, -560.0]
+target_mm = [0.0, 0.0, 0.0]
+blur_px = 0.6
+"""
+SCENE = """
+[[object]]
+name = "relief"
+shape = "relief"
+size_mm = [130.0, 100.0]
+step_mm = 0.5
+albedo = 0.85
+texture = { kind = "noise", contrast = 0.25, scale_mm = 6.0 }
+bump = [{ centre_mm = [-25.0, -10.0], height_mm = 16.0, sigma_mm = 14.0 }]
+"""
+
+
+def spent(service: psutil.Process) -> tuple[float, float]:
+    """Processor seconds and resident MB of a service and its processes."""
+    each = [service, *service.children(recursive=True)]
+    times = [process.cpu_times() for process in each]
+    return sum(used.user + used.system for used in times), sum(process.memory_info().rss for process in each) / 1e6
+
+
+def test_depth_images_a_second_their_cost_and_their_delay(start: Start, tmp_path: Path) -> None:
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "rig.toml").write_text(RIG)
+    service = start(tmp_path / "rig.toml")
+    process = psutil.Process(service.process.pid)
+    with service.client() as client:
+        while client.system.readiness()["pending"]:
+            time.sleep(0.5)
+        client.live.start()
+        delays_s, count = [], -20
+        for frame in client.live.watch(step=3):
+            count += 1
+            if count == 0:
+                (begun_s, before_mb), begun = spent(process), time.monotonic()
+            elif count > 0:
+                delays_s.append(frame.facts["age_s"])
+                if time.monotonic() - begun > SECONDS:
+                    break
+        (ended_s, after_mb), took_s = spent(process), time.monotonic() - begun
+        service.process.kill()
+        killed = time.monotonic()
+        while any(each.status() != psutil.STATUS_ZOMBIE for each in process.children(recursive=True)):
+            time.sleep(0.01)
+    print(  # noqa: T201
+        f"\n{count / took_s:.1f} depth images a second, {(ended_s - begun_s) / took_s:.2f} cores, delay "
+        f"{np.median(delays_s) * 1e3:.0f} ms (95 %: {np.quantile(delays_s, 0.95) * 1e3:.0f}), {before_mb:.0f} MB, "
+        f"{after_mb - before_mb:+.0f} MB at the end; processes gone {time.monotonic() - killed:.2f} s after a kill"
+    )
+    assert count / took_s > 10
