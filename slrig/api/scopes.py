@@ -34,11 +34,11 @@ RIG_FILE = ("/rig/file", "/rig/settings")
 
 
 def needed_scope(method: str, path: str) -> KeyScope:
-    """The scope that a key needs for a request. Reading needs `look`, except a preview, which uses the rig, and the rig
-    file.
+    """The scope that a key needs for a request. Reading needs `look`, except a preview and live depth, which use the
+    rig, and the rig file.
 
-    >>> [str(needed_scope("GET", path)) for path in ("/scan", "/preview/left", "/audit")]
-    ['look', 'scan', 'administer']
+    >>> [str(needed_scope("GET", path)) for path in ("/scan", "/live", "/preview/left", "/live/depth", "/audit")]
+    ['look', 'look', 'scan', 'scan', 'administer']
     >>> [str(needed_scope("POST", path)) for path in ("/scan", "/rig/verification", "/schedule")]
     ['scan', 'calibrate', 'administer']
     >>> [str(needed_scope(method, "/rig/file")) for method in ("GET", "PUT")]
@@ -54,4 +54,4 @@ def needed_scope(method: str, path: str) -> KeyScope:
 
 def moves(method: str, path: str) -> bool:
     """Whether a request changes something, or moves light or rig."""
-    return method not in READING or path.startswith("/preview/")
+    return method not in READING or path.startswith(("/preview/", "/live/"))

@@ -356,7 +356,7 @@ def test_every_operation_has_the_scope_of_its_path() -> None:
             if path in {"/audit", "/rig/file", "/rig/settings"}:
                 assert scope is KeyScope.ADMINISTER
             elif method.upper() in READING:
-                assert scope is (KeyScope.SCAN if path.startswith("/preview/") else KeyScope.LOOK)
+                assert scope is (KeyScope.SCAN if path.startswith(("/preview/", "/live/")) else KeyScope.LOOK)
             elif not path.startswith(("/session", "/schedule", "/preset", "/notices")):
                 assert scope in {KeyScope.SCAN, KeyScope.CALIBRATE}, (method, path)
 
