@@ -9,14 +9,17 @@ renders the frames), worker and live process together; the delay is from a frame
 from __future__ import annotations
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import psutil
 
-from tests.e2e.conftest import Start
+from slrig.client import Client
+from slrig.client.live import split_messages
+from tests.e2e.conftest import KEY, Start
 
-SECONDS = 60.0
+SECONDS, SHORT_S, VIEWERS = 60.0, 10.0, 20
 RIG = """
 name = "large"
 [head]
@@ -60,12 +63,23 @@ def spent(service: psutil.Process) -> tuple[float, float]:
     return sum(used.user + used.system for used in times), sum(process.memory_info().rss for process in each) / 1e6
 
 
+def read_raw(url: str) -> float:
+    """Messages a second that one viewer reads."""
+    with Client(url, KEY) as client, client.connection.streamed("/live/depth", params={"step": 3}) as pieces:
+        begun, count = time.monotonic(), 0
+        for head, _ in split_messages(pieces):
+            count += head["kind"] == "depth"
+            if time.monotonic() - begun > SHORT_S:
+                break
+        return count / (time.monotonic() - begun)
+
+
 def test_depth_images_a_second_their_cost_and_their_delay(start: Start, tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text(SCENE)
     (tmp_path / "rig.toml").write_text(RIG)
     service = start(tmp_path / "rig.toml")
     process = psutil.Process(service.process.pid)
-    with service.client() as client:
+    with service.client() as client, ThreadPoolExecutor(VIEWERS) as pool:
         while client.system.readiness()["pending"]:
             time.sleep(0.5)
         client.live.start()
@@ -79,10 +93,15 @@ def test_depth_images_a_second_their_cost_and_their_delay(start: Start, tmp_path
                 if time.monotonic() - begun > SECONDS:
                     break
         (ended_s, after_mb), took_s = spent(process), time.monotonic() - begun
+        before = client.live.status()["facts"]["number"]
+        begun, read = time.monotonic(), [pool.submit(read_raw, service.url) for _ in range(VIEWERS)]
+        messages = [each.result() for each in read]
+        beside = (client.live.status()["facts"]["number"] - before) / (time.monotonic() - begun)
         service.process.kill()
         killed = time.monotonic()
         while any(each.status() != psutil.STATUS_ZOMBIE for each in process.children(recursive=True)):
             time.sleep(0.01)
+    print(f"\n{VIEWERS} more viewers: {beside:.1f} a second, of which each read {np.mean(messages):.1f}")  # noqa: T201
     print(  # noqa: T201
         f"\n{count / took_s:.1f} depth images a second, {(ended_s - begun_s) / took_s:.2f} cores, delay "
         f"{np.median(delays_s) * 1e3:.0f} ms (95 %: {np.quantile(delays_s, 0.95) * 1e3:.0f}), {before_mb:.0f} MB, "
