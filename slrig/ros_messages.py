@@ -26,6 +26,7 @@ POINT_FIELDS = ("x", "y", "z", "normal_x", "normal_y", "normal_z", "rgb", "sigma
 """Numbers of a point, float32; PCL and RViz read those of its known names."""
 
 LIVE_FIELDS = ("x", "y", "z", "sigma", "intensity")
+"""The same of a live depth image, in messages and in files."""
 
 TF_STATIC = "/tf_static"
 _FLOAT32 = 7  # sensor_msgs/msg/PointField

@@ -12,11 +12,10 @@ import typer
 from slrig.cli.options import ServiceOptions, grouped
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError
+from slrig.ros_messages import LIVE_FIELDS
 
 if TYPE_CHECKING:
     from slrig.client import LiveFrame
-
-_PCD_FIELDS = ("x", "y", "z", "sigma", "intensity")
 
 
 @grouped
@@ -101,14 +100,9 @@ def encode_organised(frame: LiveFrame) -> bytes:
     """PCD 0.7, binary, organised: x y z and σ in mm, in the camera's frame, and grey; NaN unless measured."""
     import numpy as np
 
+    from slrig.scan.clouds import pcd_of
+
     points = frame.points_mm
     sigma = np.where(frame.state == 0, frame.sigma_mm, np.float32(np.nan))
     table = np.concatenate([points, sigma[..., None], frame.grey[..., None].astype(np.float32)], axis=2)
-    high, wide = frame.state.shape
-    count = len(_PCD_FIELDS)
-    head = (
-        f"# .PCD v0.7 - slrig, millimetres\nVERSION 0.7\nFIELDS {' '.join(_PCD_FIELDS)}\nSIZE {'4 ' * count}\n"
-        f"TYPE {'F ' * count}\nCOUNT {'1 ' * count}\nWIDTH {wide}\nHEIGHT {high}\nVIEWPOINT 0 0 0 1 0 0 0\n"
-        f"POINTS {high * wide}\nDATA binary\n"
-    ).replace(" \n", "\n")
-    return head.encode("ascii") + table.astype("<f4").tobytes()
+    return pcd_of(table.astype("<f4"), LIVE_FIELDS, (0, 0, 0, 1, 0, 0, 0))

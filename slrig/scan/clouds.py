@@ -312,23 +312,27 @@ def encode_pcd(cloud: OrganisedCloud) -> bytes:
     # Most of a second to load, and few scans are asked for as PCD.
     from scipy.spatial.transform import Rotation
 
-    high, wide = cloud.cause.shape
     x, y, z, w = Rotation.from_matrix(cloud.device.rotation.T).as_quat(canonical=True)
-    count = len(POINT_FIELDS)
+    return pcd_of(point_table(cloud), POINT_FIELDS, (*cloud.device.centre_mm, w, x, y, z))
+
+
+def pcd_of(table: NDArray[np.float32], fields: Sequence[str], viewpoint: Sequence[float]) -> bytes:
+    """PCD 0.7, binary, organised. table : (H, W, fields) float32, little-endian. viewpoint : see `encode_pcd`."""
+    high, wide, count = table.shape
     header = [
         "# .PCD v0.7 - slrig, millimetres",
         "VERSION 0.7",
-        f"FIELDS {' '.join(POINT_FIELDS)}",
+        f"FIELDS {' '.join(fields)}",
         f"SIZE {' '.join(['4'] * count)}",
         f"TYPE {' '.join(['F'] * count)}",
         f"COUNT {' '.join(['1'] * count)}",
         f"WIDTH {wide}",
         f"HEIGHT {high}",
-        f"VIEWPOINT {' '.join(f'{float(each):.9g}' for each in (*cloud.device.centre_mm, w, x, y, z))}",
+        f"VIEWPOINT {' '.join(f'{float(each):.9g}' for each in viewpoint)}",
         f"POINTS {high * wide}",
         "DATA binary",
     ]
-    return "\n".join(header).encode("ascii") + b"\n" + point_table(cloud).tobytes()
+    return "\n".join(header).encode("ascii") + b"\n" + table.tobytes()
 
 
 ENCODERS: Mapping[str, Callable[[OrganisedCloud], bytes]] = {
