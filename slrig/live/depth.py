@@ -30,7 +30,8 @@ _NODES = (0.1, 0.5, 0.9)
 without distortion is exact."""
 _BETWEEN = (0.3, 0.7)
 
-_LEAST, _MOST = 0.2, 5.0  # inverse depths, over that at which the axes of camera and projector meet
+NEAREST, FARTHEST = 0.2, 5.0
+"""Depths that are looked for, over that at which the axes of camera and projector meet."""
 
 _SAMPLED = 5  # of rows and columns, by which noise and order are judged
 _LIT = 8.0  # standard deviations of noise that a pixel's modulation must have
@@ -96,14 +97,14 @@ def ray_table(camera: Pinhole, projector: Pinhole, axis: Axis, step: int) -> Ray
     towards = rays @ projector.rotation.T @ projector.matrix.T
     offset = projector.matrix @ (projector.rotation @ camera.centre_mm + projector.translation_mm)
     inverses, positions = [], []
-    nodes = [share * projector.size.along(axis) for share in _NODES]
-    for share, at_px in zip(
-        (*_NODES, *_BETWEEN), (*nodes, *(share * projector.size.along(axis) for share in _BETWEEN)), strict=True
-    ):
+    extent_px = projector.size.along(axis)
+    nodes = [share * extent_px for share in _NODES]
+    for share in (*_NODES, *_BETWEEN):
+        at_px = share * extent_px
         with np.errstate(all="ignore"):
             inverse = (towards[:, along] - at_px * towards[:, 2]) / (at_px * offset[2] - offset[along])
         spread = 1 + 0.02 * (share - 0.5)  # keeps depths apart that the limits make equal
-        inverse = np.clip(inverse, spread * _LEAST / depth_mm, spread * _MOST / depth_mm)
+        inverse = np.clip(inverse, spread / (FARTHEST * depth_mm), spread / (NEAREST * depth_mm))
         inverses.append(inverse)
         positions.append(project(projector, camera.centre_mm + rays / inverse[:, None])[:, along])
     first, middle, last, *between = positions
@@ -532,6 +533,7 @@ def _depth_kernel(
     columns = depth.shape[1]
     per_radian = period_px / np.float32(2 * np.pi)
     least_squared = (least * steps / 2) ** 2
+    near_mm, far_mm = np.float32(NEAREST) * depth_mm, np.float32(FARTHEST) * depth_mm
     position, deviation, numbered = np.zeros((3, columns), np.float32)
     for y in range(first, last):
         for x in range(columns):
@@ -584,7 +586,7 @@ def _depth_kernel(
                 state[y, x] = 3
             elif np.isnan(z):
                 state[y, x] = 5
-            elif numbered[x] > apart or not (z > np.float32(0.2) * depth_mm and z < np.float32(5) * depth_mm):
+            elif numbered[x] > apart or not near_mm < z < far_mm:
                 state[y, x] = 4
             elif outside:
                 state[y, x] = 5

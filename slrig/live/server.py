@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.capture import NEAR_SATURATION
-from slrig.live.depth import DepthImage, LiveDecoder, PixelState
+from slrig.live.depth import FARTHEST, NEAREST, DepthImage, LiveDecoder, PixelState
 from slrig.live.process import PLACES, DepthCame, FrameCame, GeometryCame, LiveTask, Wanted
 from slrig.live.stream import depth_message, geometry_message
 
@@ -31,7 +31,7 @@ class LiveServer:
         )
         depth_mm = self._decoder.table.depth_mm
         # Ends of the quantised depths: as far as `LiveDecoder` looks.
-        self._near_mm, self._unit_mm = 0.2 * depth_mm, 4.8 * depth_mm / 65534
+        self._near_mm, self._unit_mm = NEAREST * depth_mm, (FARTHEST - NEAREST) * depth_mm / 65534
         self._steps: tuple[int, ...] = ()
         self._left_out: Counter[str] = Counter()
         self._lost = 0
