@@ -57,7 +57,7 @@ def play(
 
     exposure_s : as near as the camera can; None that of the rig file.
 
-    Raises as `slrig.capture.capture` does; single frames that fail are shown again, and end nothing.
+    Raises as `slrig.capture.sequencer.capture` does; single frames that fail are shown again, and end nothing.
     """
     settings = {name: each for name, each in rig.settings.items() if name == camera}
     if exposure_s is not None:
