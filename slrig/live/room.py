@@ -20,7 +20,7 @@ from slrig.live.process import DepthCame, GeometryCame, LiveFailed, LiveProcess,
 from slrig.model import Calibration, Shot, triangulated_axis
 
 UNWATCHED_S = 10.0
-"""Live depth that nobody watches ends after so long."""
+"""Live depth without a viewer ends after this time."""
 
 _MOST_POINTS = 1_500_000  # decoded by default
 _RATE_OF = 20  # depth images
@@ -43,7 +43,7 @@ class LiveOptions:
 @dataclass(frozen=True, slots=True)
 class LiveStatus:
     """Live depth as it is. patterns : of one cycle. playing : False while a job holds the rig. depth_per_s : of late;
-    None before. facts : of the newest depth image, as `slrig.live.process.depth_facts` has them.
+    None before. facts : of the newest depth image, as `slrig.live.server.depth_facts` has them.
     """
 
     options: LiveOptions
@@ -117,9 +117,9 @@ class LiveRoom:
     def start(
         self, options: LiveOptions, camera: CameraInfo, projector: ProjectorInfo, calibration: Calibration | None
     ) -> LiveStatus:
-        """Begin, or go on with one by the same options; another one that nobody watches is replaced.
+        """Begin, or go on with one by the same options; another one without viewers is replaced.
 
-        Raises LiveStateError: somebody watches another one. CalibrationError, PatternError: there can be none.
+        Raises LiveStateError: another one has viewers. CalibrationError, PatternError: there can be none.
         """
         if calibration is None or calibration.projector is None or options.camera not in calibration.cameras:
             message = (
@@ -136,8 +136,8 @@ class LiveRoom:
                 return self.status()
             if other is not None and other.viewers:
                 message = (
-                    f"Somebody watches live depth of camera '{other.options.camera}' with other options: watch that "
-                    "(GET /live/depth), or end it first (DELETE /live)."
+                    f"Another viewer watches live depth of camera '{other.options.camera}' with other options: watch "
+                    "that (GET /live/depth), or end it first (DELETE /live)."
                 )
                 raise LiveStateError(message)
             session = self._session = _Session(options, task)
@@ -219,17 +219,15 @@ class LiveRoom:
 
         calibration : in use now. Live depth by another one ends.
         """
-        with self._changed:
-            session = self._session
-            if session is None:
-                return
-            session.playing = True
+        session = self._session
+        if session is None:
+            return
         if calibration is None or calibration.digest != session.task.calibration.digest:
-            self._finish(
-                session, LiveStateError("Another calibration came into use. Start live depth again (POST /live).")
-            )
+            message = "Another calibration came into use. Start live depth again (POST /live)."
+            self._finish(session, LiveStateError(message))
+            return
+        session.playing = True
         process, options = session.process, session.options
-
         computed = rig.cameras[options.camera].info.limits.computed
         next_s = 0.0
 
@@ -247,13 +245,14 @@ class LiveRoom:
         try:
             play(rig, session.task.plan, options.camera, take, over, exposure_s=options.exposure_s)
         finally:
-            with self._changed:
-                session.playing = False
+            session.playing = False
 
     def _end_unless_watched(self, session: _Session) -> None:
         def look() -> None:
             if not session.viewers:
-                message = f"Nobody watched the live depth for {UNWATCHED_S:g} s, so it ended."
+                message = (
+                    f"The live depth had no viewer for {UNWATCHED_S:g} s, so it ended. Start it again (POST /live)."
+                )
                 self._finish(session, LiveStateError(message))
 
         timer = threading.Timer(UNWATCHED_S, look)
