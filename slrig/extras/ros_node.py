@@ -43,7 +43,7 @@ _ADVICE = {
 
 @dataclass(eq=False, slots=True)
 class _Run:
-    """A scan that somebody waits for. is_unwanted : whether nobody does any more. job : None until it was begun."""
+    """A scan of one goal or request. is_unwanted : whether its client gave it up. job : None until it was begun."""
 
     is_unwanted: Callable[[], bool]
     job: ScanJob | None = None
@@ -251,7 +251,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from rclpy.executors import MultiThreadedExecutor
     from rclpy.signals import SignalHandlerOptions
 
-    # With rclpy's own, a goal that is under way could not be told its end.
+    # With rclpy's own, a goal that is under way would get no result.
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(NODE)
     executor = MultiThreadedExecutor(_THREADS)
