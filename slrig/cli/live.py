@@ -12,7 +12,6 @@ import typer
 from slrig.cli.options import ServiceOptions, grouped
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError
-from slrig.ros_messages import LIVE_FIELDS
 
 if TYPE_CHECKING:
     from slrig.client import LiveFrame
@@ -100,6 +99,7 @@ def encode_organised(frame: LiveFrame) -> bytes:
     """PCD 0.7, binary, organised: x y z and σ in mm, in the camera's frame, and grey; NaN unless measured."""
     import numpy as np
 
+    from slrig.ros_messages import LIVE_FIELDS
     from slrig.scan.clouds import pcd_of
 
     points = frame.points_mm

@@ -1,6 +1,6 @@
 """A program of ROS 2 beside slrig's node: plain rclpy, which knows nothing of slrig but its action.
 
-Does what a line of JSON says, such as {"goal": "a", "label": "cup"}, and prints a line for each thing that it is told.
+Does what a line of JSON says, such as {"goal": "a", "label": "cup"}, and prints a line for each message that comes.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Peer:
         self.node.create_subscription(class_of(kind), topic, came, LATCHED if latched else 1)
 
 
-# A test that waits in vain is told by the end of this.
+# Ends, so that a test does not wait without end.
 signal.alarm(_LIMIT_S)
 rclpy.init()
 peer = Peer()

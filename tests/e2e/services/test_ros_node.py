@@ -73,7 +73,7 @@ class Process:
         print(json.dumps({"do": what, **command}), file=self.process.stdin, flush=True)
 
     def hear(self, of: str, **wanted: Any) -> dict[str, Any]:
-        """What is told of something and has these values. It is told once."""
+        """The next message about `of` with these values; each is returned once."""
         assert self.process.stdout is not None
         while True:
             for told in self._unheard:
