@@ -152,7 +152,7 @@ def ready_files(folder: DataFolder, record: JobRecord) -> dict[str, str]:
         return {}
     if MESH in names:
         names |= set(ON_REQUEST)
-        if record.state.final and folder.owns(folder.scan(record.id) / BUNDLE / CALIBRATION):
+        if record.state.final and folder.owns(folder.scan(record.id) / _calibration_used(folder.scan(record.id))):
             names.add(CALIBRATION_USED)
     return {name: f"/scan/{record.id}/{name}" for name in sorted(names)}
 
@@ -412,7 +412,13 @@ for _form, _media_type in requested_forms().items():
 @router.get(f"/{CALIBRATION_USED}", response_class=Response, responses=file_answers("application/json"))
 def fetch_calibration_used(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
     """Return the calibration that a finished scan was made with: lenses and poses of its devices."""
-    return _file(service, scan_id, f"{BUNDLE}/{CALIBRATION}", "application/json", known)
+    name = _calibration_used(service.folder.scan(scan_id))
+    return _file(service, scan_id, name, "application/json", known)
+
+
+def _calibration_used(scan: Path) -> str:
+    """Place of the calibration in the folder of a scan: its own where the scan had to find one, else the rig's."""
+    return CALIBRATION if (scan / CALIBRATION).is_file() else f"{BUNDLE}/{CALIBRATION}"
 
 
 @router.get(f"/{rejected_picture('{camera}')}", response_class=Response, responses=file_answers("image/png"))

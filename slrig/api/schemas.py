@@ -23,6 +23,7 @@ from slrig.api.problems import fault_problem
 from slrig.bundle import (
     EXPOSURE_KEYS,
     BracketSeconds,
+    CameraName,
     ExposureFactors,
     FreeText,
     PresetDocument,
@@ -36,7 +37,15 @@ from slrig.bundle import (
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobRecord, JobState
 from slrig.model import Axis, FlipRule, MeshAxes, SequenceName, Size
-from slrig.scan.plan import MOST_TURN_DEG, PatternPlan, PresetUse, ReconstructionPlan, ScanPlan, unused_options
+from slrig.scan.plan import (
+    MOST_TURN_DEG,
+    PatternPlan,
+    PresetUse,
+    ReconstructionPlan,
+    RigGuess,
+    ScanPlan,
+    unused_options,
+)
 
 MOST_EXPOSURE_S = 60.0
 MOST_REPEATS = 500
@@ -95,6 +104,37 @@ class PatternRequest(Strict):
     )
 
 
+class UncalibratedRequest(Strict):
+    """What is known of the devices of a rig that is not calibrated: the scan itself calibrates it."""
+
+    focal_px: dict[CameraName, Annotated[float, Field(gt=0)]] = Field(
+        default_factory=dict, description="focal length of cameras by name, px. Default: 1.4 times the image's width"
+    )
+    focal_sigma: Annotated[float, Field(gt=0, le=1)] = Field(
+        default=0.1, description="relative standard deviation of these lengths"
+    )
+    throw_ratio: Annotated[float, Field(gt=0, le=100)] | None = Field(
+        default=None, description="distance over width of the projector's picture. Default 1.4"
+    )
+    throw_sigma: Annotated[float, Field(gt=0, le=1)] = Field(
+        default=0.1, description="relative standard deviation of the throw ratio"
+    )
+    baseline_mm: Annotated[float, Field(gt=0, le=1e6)] | None = Field(
+        default=None,
+        description="distance of the first camera from the projector. Default: lengths are in hundredths of it",
+    )
+    baseline_sigma: Annotated[float, Field(gt=0, le=1)] = Field(
+        default=0.01, description="relative standard deviation of the baseline"
+    )
+    most_error: Annotated[float, Field(gt=0, le=1)] = Field(
+        default=0.0015, description="stated error of shape over the size of the scene beyond which it is refused"
+    )
+
+    def guess(self) -> RigGuess:
+        """The same as a plan has it."""
+        return RigGuess(**self.model_dump())
+
+
 class ReconstructionRequest(Strict):
     """How frames become a mesh. What is absent or null is as the rig file says, and else the default."""
 
@@ -133,6 +173,11 @@ class ReconstructionRequest(Strict):
         default=None,
         description="axes of mesh.ply, points.ply, STL, OBJ and 3MF: x right, y up, z towards the rig, or those of the "
         "calibration (x right, y down, z away), in which all other files and figures are. Default upright",
+    )
+    uncalibrated: UncalibratedRequest | None = Field(
+        default=None,
+        description="calibrate by the scan itself, which plays columns and rows, from these guesses, and use no "
+        "calibration of the rig; `{}` guesses all. Default: the rig's calibration",
     )
 
 
@@ -261,7 +306,11 @@ def _chosen(plan: type[Any], request: BaseModel, defaults: ScanDefaults) -> dict
         asked = getattr(request, field.name, None)
         value = asked if asked is not None else getattr(defaults, field.name, None)
         if value is not None:
-            chosen[field.name] = value.region() if isinstance(value, RegionTable) else value
+            chosen[field.name] = (
+                value.region() if isinstance(value, RegionTable)
+                else value.guess() if isinstance(value, UncalibratedRequest)
+                else value
+            )  # fmt: skip
     return chosen
 
 

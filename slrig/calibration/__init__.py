@@ -40,7 +40,9 @@ from slrig.calibration.solution import (
     DeviceResiduals,
     ExpectedError,
     Solution,
+    device_covariance,
     device_title,
+    scale_mode,
 )
 
 __all__ = [
@@ -70,10 +72,12 @@ __all__ = [
     "Solution",
     "ViewQuality",
     "decide",
+    "device_covariance",
     "device_title",
     "dispersion_mm",
     "find_balls",
     "find_plane",
     "fit_plane",
     "fit_sphere",
+    "scale_mode",
 ]

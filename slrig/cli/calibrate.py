@@ -295,6 +295,35 @@ def light(
 
 @app.command()
 @grouped
+def refine(
+    calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION", help="File of a calibration with its errors.")],
+    bundles: Annotated[
+        list[Path], typer.Argument(metavar="BUNDLE", help="Scans by columns and rows: bundles, or folders of such.")
+    ],
+    output: Annotated[Path, typer.Option(help="File for the improved calibration: .json.")],
+) -> None:
+    """Improve a calibration by ordinary scans.
+
+    Says when they contradict it. Scans that the calibration was made of must not be among them. Import the result, and
+    activate it.
+    """
+    from slrig.bundle import read_calibration, write_calibration
+    from slrig.cli.display import progress_shown
+    from slrig.cli.reconstruct import named_bundles, prepare_kernels
+    from slrig.scan.measured import refine_by_scans
+
+    prior, (found, _) = read_calibration(calibration), named_bundles(bundles)
+    with progress_shown() as display:
+        prepare_kernels(display)
+        refined, lines = refine_by_scans(prior, found, display)
+    for line in lines:
+        typer.echo(line)
+    write_calibration(output, refined)
+    typer.echo(f"{'written':<10}{output}")
+
+
+@app.command()
+@grouped
 def activate(calibration: CalibrationId, service: ServiceOptions) -> None:
     """Have scans use a calibration from now on."""
     with service.client() as client:

@@ -27,6 +27,7 @@ from slrig.cli.options import (
     AcceptanceOptions,
     AsJson,
     BoardArguments,
+    GuessOptions,
     Keys,
     MeshOptions,
     RigFile,
@@ -372,6 +373,7 @@ def scan(
         typer.Option("--cross-lines", help="Play one frame of lines along the other axis: it tests the calibration."),
     ] = False,
     mesh: MeshOptions,
+    guesses: GuessOptions,
     queue: Annotated[bool, typer.Option("--queue", help="Wait in line if the rig is held.")] = False,
     repeat: Annotated[int, typer.Option(min=1, help="So many scans in a row, each into a folder of its number.")] = 1,
     every_s: Annotated[float | None, typer.Option(help="From the start of one to that of the next, seconds.")] = None,
@@ -395,7 +397,7 @@ def scan(
             **period_option(sequence, period_px), line_shift=False if gray_only else None, rows=rows or None,
             cross_lines=cross_lines or None,
         ),
-        reconstruction=mesh.asked(),
+        reconstruction={**mesh.asked(), **given(uncalibrated=guesses.asked())},
     )  # fmt: skip
     files = tuple(file or FILES)
     if asked.budget_s is not None and not asked.assist:
@@ -431,6 +433,7 @@ def reconstruct(
         typer.Option(help="Write this, too, as mesh.stl or points-CAMERA.npz; repeatable. slrig scan has the same."),
     ] = None,
     mesh: MeshOptions,
+    guesses: GuessOptions,
     decode_only: Annotated[
         bool,
         typer.Option("--decode-only", help="Only decode: positions, causes, what to change. Needs no calibration."),
@@ -443,7 +446,9 @@ def reconstruct(
     if decode_only:
         decode_and_tell(bundles, output)
         return
-    reconstruct_and_tell(bundles, output, calibration=calibration, further=file or (), options=mesh.chosen())
+    reconstruct_and_tell(
+        bundles, output, calibration=calibration, further=file or (), options=mesh.chosen(), guess=guesses.asked()
+    )
 
 
 @app.command()

@@ -205,6 +205,57 @@ class MeshOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class GuessOptions:
+    """What the command line says of devices that are not calibrated; None where it says nothing."""
+
+    subject: ClassVar = "Without a calibration"
+
+    uncalibrated: Annotated[
+        bool, typer.Option("--uncalibrated", help="Calibrate by the scan itself: columns and rows, no board.")
+    ] = False
+    focal_px: Annotated[
+        list[str] | None,
+        typer.Option(metavar="CAMERA=PX", help="A camera's focal length, pixels: mm of the lens over mm of a pixel."),
+    ] = None
+    focal_sigma: Annotated[
+        float | None, typer.Option(help="By how much these may be wrong, relative. Default 0.1.")
+    ] = None
+    throw_ratio: Annotated[
+        float | None, typer.Option(help="Distance over width of the projector's picture, from its data sheet.")
+    ] = None
+    throw_sigma: Annotated[float | None, typer.Option(help="By how much that may be wrong, relative. Default 0.1.")] = (
+        None
+    )
+    baseline_mm: Annotated[
+        float | None, typer.Option(help="From the first camera's lens to the projector's. Default: the unit of length.")
+    ] = None
+    most_error: Annotated[
+        float | None, typer.Option(help="Refuse a shape that is known less well, over its size. Default 0.0015.")
+    ] = None
+
+    def asked(self) -> dict[str, Any] | None:
+        """What was given, as a request says it; None for a calibrated rig. Raises ConfigError: a guess without
+        --uncalibrated, or --focal-px that is no CAMERA=PX.
+        """
+        guesses = {key: value for key, value in asdict(self).items() if key != "uncalibrated" and value is not None}
+        if not self.uncalibrated:
+            if guesses:
+                name = next(iter(guesses)).replace("_", "-")
+                message = f"--{name} is a guess for a rig without a calibration; add --uncalibrated, or leave it out"
+                raise ConfigError(message)
+            return None
+        lengths = {}
+        for each in guesses.pop("focal_px", ()):
+            camera, _, value = each.partition("=")
+            try:
+                lengths[camera] = float(value)
+            except ValueError as cause:
+                message = f"--focal-px: expected CAMERA=PX, as left=1800, found '{each}'"
+                raise ConfigError(message) from cause
+        return {**guesses, "focal_px": lengths}
+
+
+@dataclass(frozen=True, slots=True)
 class AcceptanceOptions:
     """What the command line says of artefacts and limits; None where it says nothing. Lengths in mm."""
 

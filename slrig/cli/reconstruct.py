@@ -26,7 +26,7 @@ from slrig.jobs.listener import PREPARING, Listener
 from slrig.logs import set_up_console_logs
 from slrig.scan.artefacts import MESH, ON_REQUEST, REPORT, report_summary, write_converted
 from slrig.scan.formats import BUNDLE_ZIP, CALIBRATION_USED, missing_for, offered, on_demand
-from slrig.scan.plan import ReconstructionPlan
+from slrig.scan.plan import ReconstructionPlan, RigGuess
 
 Row = tuple[str, ...]
 """What the table says of a bundle, or of one of its cameras, beside name and seconds; the last cell is a remark."""
@@ -238,15 +238,25 @@ def decode_and_tell(asked: Sequence[Path], output: Path) -> None:
 
 
 def reconstruct_and_tell(
-    asked: Sequence[Path], output: Path, *, calibration: Path | None, further: Sequence[str], options: Mapping[str, Any]
+    asked: Sequence[Path],
+    output: Path,
+    *,
+    calibration: Path | None,
+    further: Sequence[str],
+    options: Mapping[str, Any],
+    guess: Mapping[str, Any] | None = None,
 ) -> None:
     """Reconstruct, show the progress, and print where the results lie. Raises what the pipeline raises, and of several
     bundles what `work_through` does.
 
-    further : names of files that are written as well; options : fields of `ReconstructionPlan` that were given.
+    further : names of files that are written as well; options : fields of `ReconstructionPlan` that were given; guess :
+    fields of `RigGuess`, for bundles without a calibration. Raises ConfigError: there is a calibration beside it.
     """
     set_up_console_logs()
-    plan = ReconstructionPlan(**options)
+    if guess is not None and calibration is not None:
+        message = "--uncalibrated finds a calibration, and --calibration gives one; leave one of the two out"
+        raise ConfigError(message)
+    plan = ReconstructionPlan(**options, uncalibrated=None if guess is None else RigGuess(**guess))
     bundles, several = named_bundles(asked)
     # What is wrong with the files is said at once, not after a minute in which kernels are compiled.
     further = tuple(dict.fromkeys(further))

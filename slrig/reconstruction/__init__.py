@@ -67,6 +67,7 @@ from slrig.reconstruction.redundancy import (
     sheet_coordinates,
 )
 from slrig.reconstruction.second_axis import AxisPositions, axis_residuals, decode_second_axis
+from slrig.reconstruction.self_calibration import DeviceGuess, SelfCalibration, guessed_calibration, self_calibrate
 from slrig.reconstruction.sinusoids import SinusoidResponse, decode_sinusoids
 from slrig.reconstruction.triangulation import (
     CONVERGED,
@@ -110,6 +111,7 @@ __all__ = [
     "CodeTables",
     "CorrespondenceLimits",
     "DecodingLimits",
+    "DeviceGuess",
     "DeviceNames",
     "ExposureUse",
     "FrameStacks",
@@ -124,6 +126,7 @@ __all__ = [
     "Redundancy",
     "RefinedPose",
     "RegionMask",
+    "SelfCalibration",
     "SheetCurves",
     "SinusoidResponse",
     "StripeEnsemble",
@@ -152,6 +155,7 @@ __all__ = [
     "find_cross_line_pairs",
     "fuse_colour",
     "fuse_exposures",
+    "guessed_calibration",
     "has_phase",
     "intersect_light_sheets",
     "linearise",
@@ -171,6 +175,7 @@ __all__ = [
     "sample_format",
     "sampling_mm",
     "select_points",
+    "self_calibrate",
     "share_in_front",
     "sheet_coordinates",
     "sigma_along_normal",

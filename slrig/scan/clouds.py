@@ -365,7 +365,9 @@ def cloud_file(
         A file of the scan cannot be read.
     """
     bundle = bundle or folder / BUNDLE
-    calibration = calibration or bundle / CALIBRATION
+    # A scan of a rig without a calibration has made its own.
+    own = folder / CALIBRATION
+    calibration = calibration or (own if own.exists() else bundle / CALIBRATION)
     encode: Callable[..., bytes] = ENCODERS.get(form) or next(each.encode for each in formats() if each.name == form)
     if "{camera}" not in form:
         return encode(*_whole_scan(folder, bundle, calibration))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 from uuid import UUID, uuid4
@@ -12,7 +12,7 @@ from uuid import UUID, uuid4
 from pydantic import TypeAdapter
 
 from slrig.disk import storage_errors
-from slrig.errors import JobNotFoundError, NotCalibratedError
+from slrig.errors import JobNotFoundError, NotCalibratedError, setting
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.job import Job, JobRun, Outcome, Recording
 from slrig.jobs.records import JobKind, JobRecord, utc_now
@@ -48,7 +48,8 @@ def plan_from_json(document: Mapping[str, Any]) -> ScanPlan:
 _NOT_CALIBRATED = (
     "This rig is not calibrated, and without a calibration a scan has no millimetres. Nothing was captured. Calibrate "
     "it (slrig calibrate run; POST /calibration; Calibrate on the page), or import a calibration of it and activate "
-    "that (slrig calibrate import; POST /calibration/import)."
+    "that (slrig calibrate import; POST /calibration/import). For a first shape without a board, scan with "
+    f"{setting('uncalibrated')}."
 )
 
 PIPELINE = "slrig.scan.reconstruct"
@@ -107,12 +108,16 @@ class ScanJob(Job):
         rig.refuse_misfit()
         if rig.facts is None:
             return 0
+        if self.plan.reconstruction.uncalibrated is not None:
+            return 2 * check_plan(self.plan, rig.facts)
         if rig.calibration is None:
             raise NotCalibratedError(_NOT_CALIBRATED)
         return 2 * check_plan(self.plan, rig.facts, rig.calibration)
 
     def capture(self, rig: RigSession, run: JobRun) -> Recording:
-        """Record a bundle, and show its frames to the worker meanwhile."""
+        """Record a bundle, and show its frames to the worker meanwhile, if their devices are calibrated."""
+        if self.plan.reconstruction.uncalibrated is not None:
+            return capture_frames(replace(rig.open(), calibration=None), self.plan, run.recording, run)
         return capture_frames(rig.open(), self.plan, run.recording, run, frames=run.frames, health=rig.health())
 
     def compute(self, run: JobRun) -> Outcome:

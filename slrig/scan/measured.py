@@ -84,10 +84,11 @@ from slrig.scan.losses import (
     require_code_on_projector,
     require_surface,
 )
-from slrig.scan.plan import FAIR_SHARE, left_out_notes, weakness
+from slrig.scan.plan import FAIR_SHARE, RigGuess, left_out_notes, weakness
 from slrig.scan.preparation import UsableFiles, usable_files
 from slrig.scan.report import capture_notes, capture_report, layout_notes, lit_pixels, lit_share
 from slrig.scan.stream import CameraResult, LiveScan, ScanStream, cell_px, limited, step_px
+from slrig.scan.uncalibrated import calibrated_by_scan, guessed_rig, pairs_of_both_axes, refined_by_pairs
 
 _WIDEST_GAP_PX = 4.0
 _WIDEST_GAP_STEPS = 2.5  # of the usual distance of two points along a curve
@@ -529,17 +530,20 @@ def measured(
     region: Region | None = None,
     judged: EvidenceSummary | None = None,
     drop_finest_bits: int = 0,
+    uncalibrated: RigGuess | None = None,
 ) -> tuple[Walked, Triangulated]:
     """The points of a recorded bundle: of the frames that came while it was captured, or else of its files.
 
     axis : the one that was asked for; None for that which tells most of depth. region : what of the scene is asked for.
     judged : what the frames proved as they were captured; without it, files of one exposure are judged again.
-    drop_finest_bits : as in `slrig.scan.plan.ReconstructionPlan`.
+    drop_finest_bits, uncalibrated : as in `slrig.scan.plan.ReconstructionPlan`.
 
     Raises
     ------
     BundleError, CalibrationError, PatternError
         The bundle cannot be used as it is.
+    SolveRefusedError
+        There is no calibration, and the scan determines none.
     NothingToReconstructError
         No pixel could be decoded, no stripe be found, or the light tells no depth.
     """
@@ -547,17 +551,30 @@ def measured(
         _walked, folder, calibration_file, entered=entered, region=region, judged=judged,
         drop_finest_bits=drop_finest_bits,
     )  # fmt: skip
-    walked = walk(live, axis=axis)
+    if uncalibrated is None:
+        walked = walk(live, axis=axis)
+    else:
+        guess = guessed_rig(open_bundle(folder).outline, uncalibrated)
+        walked = walk(None, axis=axis, devices=guess)
+        entered("calibrate by the scan itself", 0.58, "")
+        own = calibrated_by_scan(folder, guess, uncalibrated, {each.name: each.second for each in walked.seen})
+        seen = [replace(each, device=own.calibration.cameras[each.name]) for each in walked.seen]
+        walked = replace(walked, devices=own.calibration, seen=seen)
+        walked.sections["self_calibration"] = own.report
+        walked.notes[:0] = own.notes
     tries = [_tried(walked, folder, entered, region)]
     others = walked.shown - {walked.axis} if axis is None else frozenset()
     for other in others:
         if _is_weak(tries[0]):
-            again = walk(None, axis=other)
+            again = walk(None, axis=other, devices=None if uncalibrated is None else walked.devices)
             tries.append(_tried(again, folder, entered, region))
     sound = [each for each in tries if not isinstance(each, NothingToReconstructError)]
     if not sound:
         raise next(each for each in tries if isinstance(each, NothingToReconstructError))
     best, found = max(sound, key=lambda each: _depth_known(*each)) if len(sound) > 1 else sound[0]
+    if uncalibrated is not None and best.axis is not walked.axis:
+        best.sections["self_calibration"] = walked.sections["self_calibration"]
+        best.notes[:0] = own.notes
     best.notes.extend(_chosen_notes(walked, best, found))
     best.notes.extend(left_out_notes(best.axis, {seen.name: seen.device for seen in best.seen}, best.devices.projector))
     words = weakness(best.axis, best.shown, found.baseline_sine, on_request=axis is not None)
@@ -569,6 +586,35 @@ def measured(
             raise NothingToReconstructError(message)
         best.notes.append(words)
     return replace(best, seen=found.cameras), found
+
+
+def refine_by_scans(prior: Calibration, bundles: Sequence[Path], entered: Entered) -> tuple[Calibration, list[str]]:
+    """A calibration improved by scans by columns and rows, and what changed, a line each.
+
+    Raises
+    ------
+    BundleError, CalibrationError, PatternError
+        A bundle cannot be used, or is of other devices; or the calibration does not state its errors.
+    SolveRefusedError
+        A bundle has one axis, or the scans leave the shape open.
+    """
+    if prior.solved is None:
+        message = (
+            "expected a calibration that states its errors, so that scans can be weighed against them, found none; "
+            f"solve it from board poses, or take that of a scan with {setting('uncalibrated')}"
+        )
+        raise CalibrationError(message)
+    scans = []
+    for place, bundle in enumerate(bundles):
+
+        def stage(name: str, fraction: float, detail: str, place: int = place) -> None:
+            entered(name, (place + fraction) / len(bundles), f"{place + 1} of {len(bundles)}, {detail}")
+
+        walked = _walked(
+            bundle, None, None, entered=stage, axis=None, region=None, judged=None, drop_finest_bits=0, devices=prior
+        )
+        scans.append(pairs_of_both_axes(bundle, {each.name: each.second for each in walked.seen}))
+    return refined_by_pairs(prior, scans)
 
 
 def _tried(
@@ -669,8 +715,12 @@ def _walked(
     region: Region | None,
     judged: EvidenceSummary | None,
     drop_finest_bits: int,
+    devices: Calibration | None = None,
 ) -> Walked:
-    """Frames to curves: those that came while the scan was captured, or else those of the bundle, along `axis`."""
+    """Frames to curves: those that came while the scan was captured, or else those of the bundle, along `axis`.
+
+    devices : to use in place of the calibration of the bundle.
+    """
     names: list[str] = []
     cut_short: tuple[str, ...] = ()
     not_used: str | None = None
@@ -687,6 +737,7 @@ def _walked(
 
     if (
         live is not None
+        and devices is None
         and live.evidence is not None
         and live.one_exposure
         and axis in (None, live.axis)
@@ -695,16 +746,16 @@ def _walked(
         and _is_of(live, folder, calibration_file)
     ):
         names += live.header.cameras
-        devices, evidence = live.calibration, live.evidence
+        own, evidence = live.calibration, live.evidence
         stream: ScanStream = live
-        _require_calibration(folder, names, devices)
+        devices = _require_calibration(folder, names, own)
         usable = _usable(folder, open_bundle(folder, calibration_file=calibration_file), evidence)
         if usable is None:
             seen = live.finished(stage_entered)
     else:
         files = open_bundle(folder, calibration_file=calibration_file)
         names += files.outline.cameras
-        devices = _require_calibration(folder, names, files.calibration)
+        devices = _require_calibration(folder, names, devices or files.calibration)
         try:
             stream, evidence, cut_short = _streamed(
                 files, devices, stage_entered, axis, region, judged, drop_finest_bits

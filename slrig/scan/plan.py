@@ -140,6 +140,37 @@ def unused_options(sequence: SequenceName) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, slots=True)
+class RigGuess:
+    """What is known of the devices of a rig that is not calibrated.
+
+    focal_px : focal length of cameras by name, px; None stands for all cameras that are not named. The others are
+    assumed to see 1.4 times as far as wide. focal_sigma : relative standard deviation of the lengths that are given.
+    throw_ratio : distance over width of the projector's picture; throw_sigma : its relative standard deviation.
+    baseline_mm : distance of the first camera from the projector; without it lengths are in hundredths of that
+    distance. baseline_sigma : its relative standard deviation. most_error : stated error of shape over the size of the
+    scene beyond which the scan is refused.
+
+    Raises ConfigError: a value is not positive and finite.
+    """
+
+    focal_px: Mapping[str, float] = field(default_factory=dict)
+    focal_sigma: float = 0.1
+    throw_ratio: float | None = None
+    throw_sigma: float = 0.1
+    baseline_mm: float | None = None
+    baseline_sigma: float = 0.01
+    most_error: float = 0.0015
+
+    def __post_init__(self) -> None:
+        numbers: dict[str, float | None] = {f"focal_px of '{name}'": each for name, each in self.focal_px.items()}
+        numbers |= {each.name: getattr(self, each.name) for each in fields(self) if each.name != "focal_px"}
+        for name, value in numbers.items():
+            if value is not None and not 0 < value < math.inf:
+                message = f"uncalibrated: expected a positive number as {name}, found {value:g}; correct it"
+                raise ConfigError(message)
+
+
+@dataclass(frozen=True, slots=True)
 class ReconstructionPlan:
     """How frames become a mesh.
 
@@ -154,6 +185,7 @@ class ReconstructionPlan:
     the camera does not resolve.
     mesh_axes : of mesh.ply, points.ply, STL, OBJ and 3MF, `MeshAxes` or its value. All other files and figures are in
     the axes of the calibration; GLB has axes of its own.
+    uncalibrated : calibrate the rig by the scan itself, from these guesses; None uses the rig's calibration.
 
     Raises
     ------
@@ -171,6 +203,7 @@ class ReconstructionPlan:
     region: Region | None = None
     drop_finest_bits: int = 0
     mesh_axes: MeshAxes = MeshAxes.UPRIGHT
+    uncalibrated: RigGuess | None = None
 
     def __post_init__(self) -> None:
         if not 1 < self.depth_edge_ratio < math.inf:
@@ -283,6 +316,14 @@ class ScanPlan:
         if self.exposure_factors is not None and (self.exposure_s or self.exposures_s):
             message = "expected exposure_factors alone, found exposure times beside them; keep one of them"
             raise ConfigError(message)
+        if self.reconstruction.uncalibrated is not None:
+            if self.patterns.rows is False:
+                message = (
+                    f"{setting('rows')}: expected columns and rows for a rig without a calibration, found columns "
+                    "alone; leave it out"
+                )
+                raise ConfigError(message)
+            object.__setattr__(self, "patterns", replace(self.patterns, rows=True))
         if self.exposures_s is None:
             return
         if self.exposure_s is not None:

@@ -15,7 +15,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle import read_capture, read_health, read_notes, read_truth, read_turntable_angle, write_file
+from slrig.bundle import (
+    CALIBRATION,
+    read_capture,
+    read_health,
+    read_notes,
+    read_truth,
+    read_turntable_angle,
+    write_calibration,
+    write_file,
+)
 from slrig.capture import EvidenceSummary
 from slrig.disk import storage_errors
 from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, setting
@@ -240,9 +249,9 @@ def reconstruct_into(
     judged : what the frames proved as they were captured, so that they need not be judged again.
     where : `slrig.jobs.worker.Task.where`, for the report.
 
-    Writes mesh.ply first, then mesh.glb and points.ply, then preview.png, two pictures of the refused pixels
-    per camera, and report.json. Each file appears whole, and the listener is told its name; whoever keeps the folder
-    has to bring it to disk.
+    Writes mesh.ply first (of an uncalibrated rig calibration.json before it), then mesh.glb and points.ply, then
+    preview.png, two pictures of the refused pixels per camera, and report.json. Each file appears whole, and the
+    listener is told its name; whoever keeps the folder has to bring it to disk.
 
     Raises
     ------
@@ -250,6 +259,8 @@ def reconstruct_into(
         The bundle cannot be used as it is.
     NothingToReconstructError
         The frames hold no surface.
+    SolveRefusedError
+        The plan has no calibration, and the scan determines none.
     ScanCancelledError
         The listener had it cancelled.
     StorageError
@@ -281,8 +292,11 @@ def reconstruct_into(
         entered("read bundle", 0.0, str(bundle))
         walked, found = measured(
             bundle, calibration, live, entered, axis=plan.axis, region=plan.region, judged=judged,
-            drop_finest_bits=plan.drop_finest_bits,
+            drop_finest_bits=plan.drop_finest_bits, uncalibrated=plan.uncalibrated,
         )  # fmt: skip
+        if plan.uncalibrated is not None:
+            write_calibration(folder / CALIBRATION, walked.devices)
+            listener.file_ready(CALIBRATION)
         meshed = _meshed(bundle, found, walked, plan, entered)
         mesh, cameras = meshed.mesh, meshed.cameras
         cameras = [with_uncovered_refused(mesh, seen) for seen in cameras]
@@ -305,7 +319,9 @@ def reconstruct_into(
         entered("pictures", 0.85, "")
         for name, picture in pictures.result().items():
             place(name, picture)
-        known = _compared_with_truth(bundle, mesh, cameras, plan.region, entered)
+        # The truth is in the world of the rig's own calibration.
+        is_own = plan.uncalibrated is not None
+        known = {} if is_own else _compared_with_truth(bundle, mesh, cameras, plan.region, entered)
         if (turntable := read_turntable_angle(bundle)) is not None:
             known["turntable"] = turntable.document()
         entered("write report", 0.98, "")

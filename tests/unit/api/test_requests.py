@@ -210,7 +210,9 @@ def test_plan_is_the_request_over_the_rig_file_over_the_default(client: TestClie
         "axis": None,
         "drop_finest_bits": 0,
         "mesh_axes": "upright",
+        "uncalibrated": None,
     }
+    assert planned({"reconstruction": {"uncalibrated": {"focal_px": {"cam0": 900}}}}).patterns.rows
     # The rig file's exposure belongs to its cameras, not to the plan.
     assert (plan["exposures_s"], plan["exposure_s"]) == ([0.08, 0.02], None)
     assert (plan["turn_deg"], plan["turned_by"]) == (None, "table")

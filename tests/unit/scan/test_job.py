@@ -44,8 +44,8 @@ from slrig.jobs.records import JobRecord, JobState, read_record, utc_now
 from slrig.jobs.resume import resume
 from slrig.model import Calibration
 from slrig.rig.session import ActiveCalibration, RigSession
-from slrig.scan.job import ScanJob, cancel_series, plan_from_json, scans_of, series
-from slrig.scan.plan import PatternPlan, ScanPlan, SeriesPlace, series_of
+from slrig.scan.job import ScanJob, cancel_series, plan_from_json, plan_json, scans_of, series
+from slrig.scan.plan import PatternPlan, ReconstructionPlan, RigGuess, ScanPlan, SeriesPlace, series_of
 from tests.core import parametrize_core
 from tests.unit.scan.bench import Bench, failure_code
 from tests.unit.scan.fakes import WAIT_S, TameBench, tame_calibration
@@ -203,6 +203,11 @@ def test_nothing_is_shot_by_a_rig_without_calibration(tmp_path: Path) -> None:
     with pytest.raises(NotCalibratedError, match="slrig calibrate run"):
         bench.scan()
     assert bench.captured == []
+    # It calibrates itself by the scan, in the worker, and plays both axes for it.
+    guess = ScanPlan(reconstruction=ReconstructionPlan(uncalibrated=RigGuess(focal_px={"cam0": 900.0})))
+    assert guess.patterns.rows is True
+    assert plan_from_json(plan_json(guess)) == guess
+    assert bench.until(bench.scan(guess).id).state is JobState.SUCCEEDED
     bench.manager.rig.use_calibration(ActiveCalibration("spring", tame_calibration()))
     assert bench.until(bench.scan().id).state is JobState.SUCCEEDED
     bench.close()

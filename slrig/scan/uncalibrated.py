@@ -1,0 +1,164 @@
+"""Scans of rigs without a calibration: guesses of the devices, and the calibration that the scan itself gives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from slrig.calibration import device_covariance, device_title, scale_mode
+from slrig.errors import SolveRefusedError, setting
+from slrig.model import Calibration, Capture, SolveRecord
+from slrig.reconstruction import DeviceGuess, PixelPairs, SelfCalibration, guessed_calibration, self_calibrate
+from slrig.scan.plan import RigGuess
+from slrig.scan.stream import SecondAxisResult
+
+UNITS_PER_BASELINE = 100.0
+"""Length of the baseline where nothing is known of it, in the unit of the results."""
+
+_DRIFTED = 3.0  # rms change of the parameters in their deviations from before
+
+_USUAL_RATIO, _USUAL_SIGMA = 1.4, 0.25
+"""Focal length over the width of the image, and its relative deviation, where nothing is known."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanCalibration:
+    """The calibration that a scan gave. report : its section in report.json; notes : sentences for a person."""
+
+    calibration: Calibration
+    report: Mapping[str, object]
+    notes: tuple[str, ...]
+
+
+def guessed_rig(outline: Capture, guess: RigGuess) -> Calibration:
+    """Devices as guessed, side by side, with the covariance of their lenses.
+    Raises SolveRefusedError: a focal length is of a camera that is not there.
+    """
+    unknown = sorted(set(guess.focal_px) - set(outline.cameras))
+    if unknown:
+        message = (
+            f"{setting('focal_px')}: it names camera {', '.join(unknown)}, and the scan has "
+            f"{', '.join(outline.cameras)}; correct the name"
+        )
+        raise SolveRefusedError(message)
+    cameras = {
+        name: DeviceGuess(
+            form.size,
+            guess.focal_px.get(name, _USUAL_RATIO * form.size.width_px),
+            guess.focal_sigma if name in guess.focal_px else _USUAL_SIGMA,
+        )
+        for name, form in outline.cameras.items()
+    }
+    ratio = guess.throw_ratio
+    size = outline.projector
+    light = DeviceGuess(
+        size, (ratio or _USUAL_RATIO) * size.width_px, _USUAL_SIGMA if ratio is None else guess.throw_sigma
+    )
+    calibration, covariance = guessed_calibration(cameras, light)
+    # Side by side, so that columns are the first axis to be tried.
+    length = guess.baseline_mm or UNITS_PER_BASELINE
+    beside = {
+        name: replace(device, translation_mm=np.array([-length * (1 + index), 0, 0]))
+        for index, (name, device) in enumerate(calibration.cameras.items())
+    }
+    record = SolveRecord("guess", datetime.now(UTC).isoformat(), covariance, np.zeros((2, 3)), 0.0)
+    return replace(calibration, cameras=beside, solved=record)
+
+
+def calibrated_by_scan(
+    folder: Path, guess: Calibration, known: RigGuess, seconds: Mapping[str, SecondAxisResult | None]
+) -> ScanCalibration:
+    """The calibration that one scan by columns and rows gives. seconds : what the second axis shows of each camera.
+
+    Raises SolveRefusedError: one axis was played, or the scan leaves the shape open.
+    """
+    pairs = pairs_of_both_axes(folder, seconds)
+    covariance = device_covariance(guess)
+    length = known.baseline_mm or UNITS_PER_BASELINE
+    try:
+        found = self_calibrate(guess, covariance, [pairs], baseline_mm=length, most_error=known.most_error)
+    except SolveRefusedError as cause:
+        raise SolveRefusedError(f"{folder}: {cause}") from cause
+    in_mm = known.baseline_mm is not None
+    scale_sigma = known.baseline_sigma if in_mm else 0.0
+    calibration = recorded(found, scale_sigma)
+    unit = "mm" if in_mm else "hundredths of the baseline"
+    focal = {name: float(change[0]) for name, change in found.changes.items()}
+    report = {
+        "shape_error": found.shape_error,
+        "shape_error_mm": found.error_mm,
+        "size_mm": found.size_mm,
+        "unit": "mm" if in_mm else "baseline/100",
+        "scale_sigma": scale_sigma if in_mm else None,
+        "pairs": found.pairs,
+        "residual_px": found.residual_px,
+        "focal_changed": focal,
+    }
+    words = (
+        f"calibrated by this scan alone: its shape is known to {found.shape_error:.2%} of its size "
+        f"({found.error_mm:.2g} of {found.size_mm:.3g} {unit}, one standard deviation). "
+    )
+    words += (
+        f"Its size is as right as the baseline that was stated ({scale_sigma:.1%}). "
+        if in_mm
+        else "All lengths are in hundredths of the distance from the first camera to the projector: state it "
+        f"({setting('baseline_mm')}) for millimetres. "
+    )
+    return ScanCalibration(calibration, report, (words + "Calibrate with a board for less",))
+
+
+def pairs_of_both_axes(folder: Path, seconds: Mapping[str, SecondAxisResult | None]) -> dict[str, PixelPairs]:
+    """The pixels that each camera and the projector share. Raises SolveRefusedError: a camera has one axis."""
+    pairs = {name: each.pairs for name, each in seconds.items() if each is not None}
+    if len(pairs) < len(seconds):
+        message = (
+            f"{folder}: expected columns and rows of every camera to calibrate by a scan, found one axis of "
+            f"{', '.join(sorted(set(seconds) - set(pairs)))}; scan with {setting('rows')}"
+        )
+        raise SolveRefusedError(message)
+    return pairs
+
+
+def refined_by_pairs(prior: Calibration, scans: Sequence[Mapping[str, PixelPairs]]) -> tuple[Calibration, list[str]]:
+    """A calibration improved by the pairs of scans, and what changed, a line each. Raises SolveRefusedError: see
+    `self_calibrate`.
+    """
+    found = self_calibrate(prior, device_covariance(prior), scans, most_error=np.inf)
+    names = [*prior.cameras, "projector"]
+    scale_sigma = 0.0 if prior.solved is None else prior.solved.scale_sigma
+    lines = [
+        f"shape     known to {found.shape_error:.2%} of the scenes' size ({found.error_mm:.2g} of {found.size_mm:.3g})",
+        f"pairs     {found.pairs} in {len(scans)} scans, {found.residual_px:.3f} px from their epipolar lines",
+    ]
+    for name in names:
+        focal, x, y = found.changes[name]
+        lines.append(f"{device_title(name)}: focal length {focal:+.2%}, principal point {x:+.2f}, {y:+.2f} px")
+    if found.moved_sigma > _DRIFTED:
+        lines.append(
+            f"drift     the scans contradict the calibration: its parameters had to change by {found.moved_sigma:.1f} "
+            "of their own deviations. A device was moved, refocused or zoomed since, or the calibration understates "
+            "its error: verify it with the board (slrig verify)"
+        )
+    # The covariance holds the scale already, which pairs do not touch.
+    refined = recorded(found, 0.0)
+    if refined.solved is not None:
+        refined = replace(refined, solved=replace(refined.solved, scale_sigma=scale_sigma))
+    return refined, lines
+
+
+def recorded(found: SelfCalibration, scale_sigma: float) -> Calibration:
+    """The calibration with a record of its error. scale_sigma : relative deviation of the scale, which pairs leave
+    open.
+    """
+    calibration = found.calibration
+    mode = scale_sigma * scale_mode(calibration)
+    covariance = found.covariance + np.outer(mode, mode)
+    record = SolveRecord(
+        f"self-{calibration.digest}", datetime.now(UTC).isoformat(), covariance, found.volume_mm, found.error_mm,
+        scale_sigma,
+    )  # fmt: skip
+    return replace(calibration, solved=record)
