@@ -1,4 +1,4 @@
-"""The bench of public captures measures right, on captures that are made up here."""
+"""The bench of public captures measures right, on captures that are made up here, and its table is of its recipes."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ import pytest
 from slrig.importers.orders import ProjectorCode, slstudio_micro_sequence
 from slrig.model import Size
 from slrig.patterns import encode
+from tests.bench.field.__main__ import BEGIN, END, METHODS, README, agree
 from tests.bench.field.measures import Floats, Reference, among, figures
 from tests.bench.field.methods import AXES, gray_positions, phase_positions, triangulate
+from tests.bench.field.recipes import CAPTURES, DIGEST
 
 EXTENT = Size(400, 300)
 CAMERA: dict[str, Any] = {"matrix": [[500.0, 0, 60], [0, 500.0, 50], [0, 0, 1]], "distortion": [-0.1, 0.05, 0, 0, 0]}
@@ -80,3 +82,15 @@ def test_errors_are_those_that_were_planted(published: bool) -> None:
     assert found.p95_mm == pytest.approx(np.percentile(np.abs(error + 40 * gross), 95), rel=0.1)
     assert found.gross == pytest.approx(gross.mean(), rel=0.15)
     assert found.within_sigma == pytest.approx(0.683 * 0.97, abs=0.02)
+
+
+def test_the_table_is_of_the_recipes() -> None:
+    table = README.read_text(encoding="utf-8").partition(BEGIN)[2].partition(END)[0]
+    assert f"of recipes {DIGEST} " in table
+    rows = [line.split(" | ")[:2] for line in table.splitlines() if line.startswith("| ")][1:]
+    assert rows == [[f"| {name}", METHODS[each]] for name, recipe in CAPTURES.items() for each in recipe["methods"]]
+
+
+@pytest.mark.parametrize(("other", "same"), [("0.104", True), ("0.106", False), ("not installed", False)])
+def test_two_runs_agree_to_five_per_cent_but_for_cpu(other: str, same: bool) -> None:
+    assert agree(f"| board | slrig | {other} | none | 3.0 |", "| board | slrig | 0.100 | none | 9.0 |") is same
