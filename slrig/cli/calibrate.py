@@ -17,6 +17,7 @@ from slrig.cli.options import (
     BoardArguments,
     Keys,
     RigOption,
+    RobotOptions,
     ServiceOptions,
     SubjectsCommand,
     Unit,
@@ -169,6 +170,56 @@ def run(
             exposure_s=exposure_s,
             board_shape=board_shape,
         )
+
+
+@app.command(cls=SubjectsCommand)
+@grouped
+def hand_eye(
+    poses: Annotated[
+        Path,
+        typer.Argument(
+            metavar="POSES", help="Poses of the flange in the base: CSV or JSON with names for its numbers, ROS's YAML."
+        ),
+    ],
+    seen: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SEEN",
+            help="A folder with a bundle (with --sphere: a scan) per pose; or poses of a body in the rig.",
+        ),
+    ],
+    asked: BoardArguments,
+    robot: RobotOptions,
+    mounting: Annotated[
+        Literal["in-hand", "fixed"] | None,
+        typer.Option(
+            "--kind", help="in-hand: the rig is on the flange; fixed: it stands still, the robot holds the target."
+        ),
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration of the rig. Default: that of the first bundle.")
+    ] = None,
+    sphere: Annotated[float | None, typer.Option(help="The target is a sphere of this diameter, mm.")] = None,
+    output: Annotated[Path | None, typer.Option(help="File for the result, hand_eye.json.")] = None,
+    check: Annotated[
+        Path | None, typer.Option(help="A hand_eye.json to hold the poses against, instead of solving: did it drift?")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find where the rig is on a robot, or in front of it.
+
+    The robot shows the rig a board or a sphere, or shows a fixed one to the rig, in 12 poses that turn about two axes.
+    """
+    from slrig.cli.hand_eye import check_poses, seen_by_rig, solve_poses
+
+    if (check is None) == (mounting is None) or (output is None) == (check is None):
+        raise ConfigError("expected --kind and --output to solve, or --check FILE alone to check; give one of the two")
+    given, identifier = seen_by_rig(poses, seen, robot.rotation, asked, calibration, sphere)
+    if check is not None:
+        if not check_poses(given, identifier, check, as_json=as_json):
+            raise typer.Exit(1)
+        return
+    solve_poses(given, identifier, str(mounting), robot, Path(str(output)), as_json=as_json)
 
 
 @app.command(name="list")

@@ -149,6 +149,24 @@ class BoardArguments:
 
 
 @dataclass(frozen=True, slots=True)
+class RobotOptions:
+    """What the command line says of a robot's poses and noise."""
+
+    subject: ClassVar = "Robot"
+
+    rotation: Annotated[
+        str | None,
+        typer.Option(help="What rx, ry, rz are: rotvec, or angles as xyz (about fixed axes), ZYX (turning along)."),
+    ] = None
+    robot_sigma: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="MM DEG", help="Noise of its poses. Default: estimated from the residuals."),
+    ] = None
+    base_frame: Annotated[str, typer.Option(help="Name of its base in ROS.")] = "base_link"
+    flange_frame: Annotated[str, typer.Option(help="Name of its flange in ROS: what the poses are of.")] = "tool0"
+
+
+@dataclass(frozen=True, slots=True)
 class MeshOptions:
     """How a mesh is made, as far as the command line says it."""
 

@@ -5,6 +5,7 @@ from slrig.importers.captures import ImageNaming, assign_images, import_capture,
 from slrig.importers.exports import lost_in_format, write_template
 from slrig.importers.folders import UnderstoodFolder, write_contact_sheet
 from slrig.importers.orders import ProjectorCode
+from slrig.importers.robot_poses import read_robot_poses
 
 __all__ = [
     "ImageNaming",
@@ -15,6 +16,7 @@ __all__ = [
     "import_capture",
     "lost_in_format",
     "parse_size",
+    "read_robot_poses",
     "write_any_calibration",
     "write_contact_sheet",
     "write_list",

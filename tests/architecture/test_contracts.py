@@ -51,7 +51,7 @@ ROOMS = (
 
 PUBLIC_MODULES = {
     # These load OpenCV or compiled kernels, which code that only names boards and calibrations must not.
-    *(f"slrig.calibration.{name}" for name in ("accuracy", "judgement", "printing")),
+    *(f"slrig.calibration.{name}" for name in ("accuracy", "hand_eye", "judgement", "printing")),
     *(f"slrig.calibration.{name}" for name in ("detection", "health", "health.drift", "health.verification")),
     *(f"slrig.calibration.{name}" for name in ("poses", "solving")),
     # These drive a rig, which a reconstruction of recorded frames has not.

@@ -1,0 +1,236 @@
+"""Hand-eye calibration from bundles or scans: what the rig saw, hand_eye.json, and the check against drift."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from slrig.bundle import FreeText, Strict, json_bytes, read_json_model, write_file
+from slrig.calibration import Board, find_balls, fit_sphere
+from slrig.errors import CalibrationError, PoseRefusedError, SlrigError
+from slrig.model import Calibration, FloatArray
+from slrig.scan.artefacts import MESH, decode_mesh_ply
+
+if TYPE_CHECKING:
+    from slrig.calibration.hand_eye import HandEye, RobotPoses, TargetPoses
+
+HAND_EYE = "hand_eye.json"
+_MAX_BYTES = 2**22
+_INDEPENDENT_POINTS = 100
+"""Points of a sphere whose errors are taken to be independent: those of neighbours in a scan are alike."""
+_MAX_POSES = 1000
+
+Row = Annotated[list[float], Field(min_length=4, max_length=4)]
+Matrix = Annotated[list[Row], Field(min_length=4, max_length=4)]
+Covariance = Annotated[
+    list[Annotated[list[float], Field(max_length=12)]],
+    Field(max_length=12, description="of a small turn (x, y, z, rad) and the translation (mm)"),
+]
+
+
+class PoseResidual(Strict):
+    """Of one pose: how far the target was from where it should have been."""
+
+    name: str
+    residual_mm: float
+    residual_deg: float | None = Field(description="null of a sphere, which shows no turns")
+
+
+class NextPose(Strict):
+    """The pose that would tell most."""
+
+    words: str
+    flange: Matrix = Field(description="of the flange in the base, mm")
+    sigma_mm: float = Field(description="deviation of the rig's place then, along its worst axis")
+
+
+class HandEyeDocument(Strict):
+    """hand_eye.json: where the rig is on or before a robot. Matrices take points of one frame to another."""
+
+    format: Literal["slrig-hand-eye"] = "slrig-hand-eye"
+    version: Literal[1] = 1
+    kind: Literal["in-hand", "fixed"] = Field(description="in-hand: the rig is on the flange. fixed: it stands still")
+    calibration: str | None = Field(description="the solve of the rig that it belongs to: its frame is the rig's")
+    base_frame: FreeText = Field(default="base_link", description="name of the robot's base, for ROS")
+    flange_frame: FreeText = Field(default="tool0", description="name of what the robot's poses are of, for ROS")
+    rig: Matrix = Field(description="rig to flange (in-hand) or to base (fixed)")
+    covariance: Covariance
+    inverse: Matrix = Field(description="flange or base to rig")
+    inverse_covariance: Covariance
+    target: Matrix = Field(description="board to base (in-hand) or to flange (fixed); of a sphere, its centre")
+    joint_covariance: Covariance = Field(
+        description="of rig and target together; of a sphere's centre, its place alone"
+    )
+    robot_sigma_mm: float
+    robot_sigma_deg: float
+    robot_sigma_estimated: bool = Field(description="from the residuals, and not stated")
+    poses: list[PoseResidual] = Field(max_length=_MAX_POSES)
+    left_out: dict[str, str] = Field(description="by pose, why it does not count")
+    remarks: list[str]
+    next_pose: NextPose | None
+
+    def rig_in_base(self, robot_pose: Sequence[Sequence[float]] | None) -> FloatArray:
+        """(4, 4): rig to base. robot_pose : of the flange in the base, which a rig in hand needs.
+
+        Raises CalibrationError if there is none.
+        """
+        if self.kind == "fixed":
+            return np.array(self.rig)
+        if robot_pose is None:
+            message = (
+                "the rig is in the robot's hand, and has a place in the robot's frame only where the flange's pose is "
+                "known: give robot_pose (4 x 4, flange in base, mm) with the scan"
+            )
+            raise CalibrationError(message)
+        return np.asarray(np.array(robot_pose) @ np.array(self.rig))
+
+
+def hand_eye_document(
+    found: HandEye,
+    calibration: str | None,
+    *,
+    base_frame: str = "base_link",
+    flange_frame: str = "tool0",
+    refused: Mapping[str, str] | None = None,
+) -> HandEyeDocument:
+    """The document of a solved one. calibration : identifier of the rig's; refused : poses that could not be used."""
+    inverse, inverse_covariance = found.inverse
+    rows = zip(found.names, found.residual_mm.tolist(), found.residual_deg.tolist(), strict=True)
+    move = found.next_move
+    return HandEyeDocument(
+        kind=found.kind.value, calibration=calibration, base_frame=base_frame, flange_frame=flange_frame,
+        rig=found.rig.tolist(), covariance=found.rig_covariance.tolist(), inverse=inverse.tolist(),
+        inverse_covariance=inverse_covariance.tolist(), target=found.target.tolist(),
+        joint_covariance=found.covariance.tolist(), robot_sigma_mm=found.robot_sigma[0],
+        robot_sigma_deg=found.robot_sigma[1], robot_sigma_estimated=found.estimated,
+        poses=[
+            PoseResidual(name=name, residual_mm=mm, residual_deg=None if np.isnan(deg) else deg)
+            for name, mm, deg in rows
+        ],
+        left_out={**(refused or {}), **found.left_out}, remarks=list(found.remarks),
+        next_pose=None if move is None
+        else NextPose(words=move.words, flange=move.flange.tolist(), sigma_mm=move.sigma_mm),
+    )  # fmt: skip
+
+
+def hand_eye_of(document: HandEyeDocument) -> HandEye:
+    """What a document says, as `check_hand_eye` takes it."""
+    from slrig.calibration.hand_eye import HandEye, HandEyeKind
+
+    return HandEye(
+        HandEyeKind(document.kind), np.array(document.rig), np.array(document.target),
+        np.array(document.joint_covariance), (document.robot_sigma_mm, document.robot_sigma_deg),
+        document.robot_sigma_estimated, tuple(each.name for each in document.poses),
+        np.array([each.residual_mm for each in document.poses]),
+        np.array([np.nan if each.residual_deg is None else each.residual_deg for each in document.poses]),
+    )  # fmt: skip
+
+
+def write_hand_eye(path: Path, document: HandEyeDocument) -> None:
+    """Write hand_eye.json. Raises StorageError."""
+    write_file(path, json_bytes(document.model_dump(mode="json")))
+
+
+def read_hand_eye(path: Path) -> HandEyeDocument:
+    """Read hand_eye.json. Raises CalibrationError, with every fault."""
+    return read_json_model(path, HandEyeDocument, "hand-eye calibration", max_bytes=_MAX_BYTES, error=CalibrationError)
+
+
+@dataclass(frozen=True, slots=True)
+class SeenTargets:
+    """What the rig saw, in pairs with the robot's poses. refused : by pose, why it could not be used."""
+
+    robot: RobotPoses
+    seen: TargetPoses
+    refused: Mapping[str, str]
+
+
+def seen_boards(
+    robot: RobotPoses,
+    bundles: Mapping[str, Path],
+    board: Board,
+    calibration: Calibration,
+    report: Callable[[float, str], None],
+) -> SeenTargets:
+    """The board's poses in bundles of the same names.
+
+    Raises PoseRefusedError if none can be used; CalibrationError: the calibration is of other cameras.
+    """
+    from slrig.calibrate.pose_reading import read_pose
+    from slrig.calibration.hand_eye import TargetPoses
+    from slrig.calibration.health.drift import estimate_board_poses
+
+    def observed(name: str) -> Any:
+        return read_pose(bundles[name], board, name).observation
+
+    chosen, poses, refused = _each_read(robot, observed, report)
+    boards = estimate_board_poses(poses, board, calibration)
+    return SeenTargets(robot.select(chosen), TargetPoses(boards.names, boards.poses, boards.covariance), refused)
+
+
+def seen_spheres(
+    robot: RobotPoses, scans: Mapping[str, Path], diameter_mm: float, report: Callable[[float, str], None]
+) -> SeenTargets:
+    """The sphere's centres in scans (folders with a mesh.ply) of the same names. Raises PoseRefusedError."""
+    from scipy.linalg import block_diag
+
+    from slrig.calibration.hand_eye import TargetPoses
+
+    def centre(name: str) -> tuple[FloatArray, FloatArray]:
+        mesh = decode_mesh_ply((scans[name] / MESH).read_bytes())
+        points = mesh.vertices_mm.astype(np.float64)
+        (ball,) = find_balls(points, mesh.normals.astype(np.float64), diameter_mm, 1)
+        fit = fit_sphere(points[ball.points])
+        outwards = (points[ball.points] - fit.centre_mm) / fit.radius_mm
+        system = np.column_stack([outwards, np.ones(len(outwards))])
+        spread = float(np.mean(fit.distances_mm**2)) * max(len(system) / _INDEPENDENT_POINTS, 1.0)
+        return fit.centre_mm, spread * np.linalg.inv(system.T @ system)[:3, :3]
+
+    chosen, found, refused = _each_read(robot, centre, report)
+    poses = np.tile(np.eye(4), (len(found), 1, 1))
+    poses[:, :3, 3] = [place for place, _ in found]
+    kept = robot.select(chosen)
+    return SeenTargets(kept, TargetPoses(kept.names, poses, block_diag(*(each for _, each in found))), refused)
+
+
+def _each_read(
+    robot: RobotPoses, read: Callable[[str], Any], report: Callable[[float, str], None]
+) -> tuple[Any, list[Any], dict[str, str]]:
+    """Numbers of the poses that could be read, what was read, and why others were refused."""
+    chosen, found, refused = [], [], {}
+    for number, name in enumerate(robot.names):
+        report(number / len(robot.names), f"{number + 1} of {len(robot.names)}")
+        try:
+            found.append(read(name))
+        except (SlrigError, OSError) as error:
+            refused[name] = str(error).splitlines()[0]
+        else:
+            chosen.append(number)
+    if not found:
+        cause = next(iter(refused.values()), "there are none")
+        message = f"none of the {len(robot.names)} poses can be used: {cause}"
+        raise PoseRefusedError(message)
+    return np.array(chosen, dtype=np.intp), found, refused
+
+
+def paired(robot: RobotPoses, folders: Mapping[str, Path]) -> RobotPoses:
+    """The robot's poses by the names of folders that belong to them: in order, if they are numbered, or by their names.
+
+    Raises CalibrationError if none or not all belong together.
+    """
+    numbered = robot.names == tuple(str(number) for number in range(1, len(robot.names) + 1))
+    if numbered and len(robot.names) == len(folders):
+        return replace(robot, names=tuple(folders))
+    common = [number for number, name in enumerate(robot.names) if name in folders]
+    if common and not numbered:
+        return robot.select(np.array(common, dtype=np.intp))
+    message = (
+        f"expected a robot pose for each of {len(folders)} folders ({', '.join(list(folders)[:3])}, …), found "
+        f"{len(robot.names)} ({', '.join(robot.names[:3])}, …): name each pose as its folder, in a column 'name'"
+    )
+    raise CalibrationError(message)

@@ -1,0 +1,214 @@
+"""`slrig calibrate hand-eye`: from files of a robot and bundles, scans or poses, to hand_eye.json and its check."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from slrig.bundle import write_calibration
+from slrig.calibrate.hand_eye import read_hand_eye
+from slrig.calibration import BoardPose
+from slrig.calibration.hand_eye import HandEyeKind
+from slrig.model import Calibration, FloatArray
+from slrig.scan.artefacts import encode_mesh_ply
+from tests.unit.calibration.posed_boards import CHESSBOARD, Shooting, two_cameras_and_projector
+from tests.unit.calibration.robot_cells import RobotCell, cell, error_of, pose
+from tests.unit.command import done, refused, slrig
+from tests.unit.scan.test_mesh_formats import example_mesh
+
+BOARD = ["--board", "chessboard", "--corners", "11x8", "--square-mm", "12"]
+
+
+def write_csv(path: Path, names: tuple[str, ...], poses: FloatArray) -> Path:
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["name", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw"])
+        for name, each in zip(names, poses, strict=True):
+            writer.writerow([name, *each[:3, 3], *Rotation.from_matrix(each[:3, :3]).as_quat()])
+    return path
+
+
+def hand_eye(*words: object) -> str:
+    return done("calibrate", "hand-eye", *words)
+
+
+def files_of(made: RobotCell, folder: Path, stem: str) -> tuple[Path, Path]:
+    robot = write_csv(folder / f"{stem}-robot.csv", made.robot.names, made.robot.poses)
+    return robot, write_csv(folder / f"{stem}-seen.csv", made.seen.names, made.seen.poses)
+
+
+def test_poses_of_a_body_become_a_file_that_new_poses_are_held_against(tmp_path: Path) -> None:
+    made, output = cell(HandEyeKind.IN_HAND, 4), tmp_path / "hand_eye.json"
+    poses = made.robot.poses.copy()
+    poses[2, :3, 3] += 3.0
+    made = replace(made, robot=replace(made.robot, poses=poses))
+    told = hand_eye(*files_of(made, tmp_path, "first"), "--kind", "in-hand", "--output", output)
+    for words in ("rig in the flange: ", "± 0.0", "left out  03: contradicts", "next      from pose", str(output)):
+        assert words in told, words
+    found = read_hand_eye(output)
+    error = error_of(np.array(found.rig), made.rig)
+    assert np.all(np.abs(error) < 4 * np.sqrt(np.diagonal(found.covariance)))
+    np.testing.assert_allclose(np.array(found.inverse) @ found.rig, np.eye(4), atol=1e-9)
+    assert (found.kind, found.flange_frame, len(found.poses)) == ("in-hand", "tool0", 11)
+    fresh = cell(HandEyeKind.IN_HAND, 50, count=2)
+    assert hand_eye(*files_of(fresh, tmp_path, "fresh"), "--check", output).startswith("holds: as if")
+    seen = replace(fresh.seen, poses=pose([0.3, 0, 0], [1.0, 0, 0]) @ fresh.seen.poses)
+    moved = files_of(replace(fresh, seen=seen), tmp_path, "moved")
+    result = slrig("calibrate", "hand-eye", *moved, "--check", output, "--json")
+    assert result.exit_code == 1
+    answer = json.loads(result.stdout)
+    assert (answer["holds"], answer["poses"][0]["name"]) == (False, "01")
+    assert answer["shift_mm"] > 3 * answer["sigma_mm"]
+
+
+@pytest.mark.parametrize("numbered", [False, True])
+def test_boards_in_bundles_are_paired_with_poses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, numbered: bool
+) -> None:
+    made = cell(
+        HandEyeKind.FIXED, 6, count=8, turns_deg=(25.0, 25.0, 20.0), spread_mm=15.0, place_mm=(20.0, -45.0, 600.0)
+    )
+    devices = two_cameras_and_projector()
+    shooting = Shooting(CHESSBOARD, devices)
+    shot = {
+        name: shooting.shot(name, BoardPose(each[:3, :3], each[:3, 3]))
+        for name, each in zip(made.robot.names, made.shown, strict=True)
+    }
+
+    def read_pose(_bundle: Path, _board: object, name: str) -> object:
+        return SimpleNamespace(observation=shot[name])
+
+    monkeypatch.setattr("slrig.calibrate.pose_reading.read_pose", read_pose)
+    calibration = Calibration({name: devices[name] for name in ("left", "right")}, devices["projector"])
+    for name in made.robot.names:
+        (tmp_path / "poses" / name / "bundle").mkdir(parents=True)
+        (tmp_path / "poses" / name / "bundle" / "bundle.json").write_text("{}")
+    robot = write_csv(tmp_path / "robot.csv", made.robot.names, made.robot.poses)
+    if numbered:
+        text = [",".join(line.split(",")[1:]) for line in robot.read_text().splitlines()]
+        robot.write_text("\n".join(text))
+    words = ["calibrate", "hand-eye", robot, tmp_path / "poses", "--kind", "fixed", "--output", tmp_path / "found.json"]
+    assert "hold no calibration: name that of the rig" in refused(slrig(*words, *BOARD))
+    write_calibration(tmp_path / "rig.json", calibration)
+    done(*words, *BOARD, "--calibration", tmp_path / "rig.json", "--base-frame", "world")
+    found = read_hand_eye(tmp_path / "found.json")
+    assert (found.calibration, found.base_frame) == (calibration.solve_id, "world")
+    error = error_of(np.array(found.rig), made.rig)
+    assert np.all(np.abs(error) < 4 * np.sqrt(np.diagonal(found.covariance)))
+    assert np.linalg.norm(error[3:]) < 0.4
+
+
+def test_spheres_in_scans_are_found(tmp_path: Path) -> None:
+    made, random = cell(HandEyeKind.IN_HAND, 7, sphere=True), np.random.default_rng(1)
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=19.05)
+    for name, each in zip(made.robot.names, made.shown, strict=True):
+        facing = ball.vertices[:, 2] < -5
+        outwards = ball.vertices[facing] / 19.05
+        points = each[:3, 3] + outwards * (19.05 + random.normal(0, 0.01, (facing.sum(), 1)))
+        plain = example_mesh()
+        mesh = replace(
+            plain, vertices_mm=points.astype(np.float32), normals=outwards.astype(np.float32),
+            faces=np.zeros((1, 3), dtype=np.int32),
+            **{key: np.zeros_like(getattr(plain, key), shape=(len(points), *getattr(plain, key).shape[1:]))
+               for key in ("colour", "mark", "sigma_mm", "stripe")},
+        )  # fmt: skip
+        (tmp_path / "scans" / name).mkdir(parents=True)
+        (tmp_path / "scans" / name / "mesh.ply").write_bytes(encode_mesh_ply(mesh))
+    robot = write_csv(tmp_path / "robot.csv", made.robot.names, made.robot.poses)
+    hand_eye(robot, tmp_path / "scans", "--sphere", 38.1, "--kind", "in-hand", "--output", tmp_path / "found.json")
+    found = read_hand_eye(tmp_path / "found.json")
+    error = error_of(np.array(found.rig), made.rig)
+    assert np.all(np.abs(error) < 4 * np.sqrt(np.diagonal(found.covariance)))
+    assert found.poses[0].residual_deg is None
+
+
+TURN = Rotation.from_euler("ZYX", [30.0, -20.0, 75.0], degrees=True)
+PLACE_MM = (412.0, -35.5, 780.25)
+
+
+def written(path: Path, rows: list[Mapping[str, Any]]) -> Path:
+    if path.suffix == ".csv":
+        lines = [",".join(rows[0]), *(",".join(map(str, row.values())) for row in rows)]
+        path.write_text("\n".join(lines))
+    else:
+        # JSON is YAML.
+        path.write_text(json.dumps(rows))
+    return path
+
+
+def forms() -> dict[str, tuple[str, str | None, dict[str, Any]]]:
+    x, y, z, w = TURN.as_quat().tolist()
+    place = dict(zip(("x_mm", "y_mm", "z_mm"), PLACE_MM, strict=True))
+    metres = {axis: each / 1000 for axis, each in zip("xyz", PLACE_MM, strict=True)}
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = TURN.as_matrix(), PLACE_MM
+    kuka = dict(zip(("a_deg", "b_deg", "c_deg"), TURN.as_euler("ZYX", degrees=True), strict=True))
+    fanuc = dict(zip(("w_deg", "p_deg", "r_deg"), TURN.as_euler("xyz", degrees=True), strict=True))
+    vector = dict(zip(("rx_rad", "ry_rad", "rz_rad"), TURN.as_rotvec(), strict=True))
+    staubli = dict(zip(("rx_deg", "ry_deg", "rz_deg"), TURN.as_euler("XYZ", degrees=True), strict=True))
+    message = {"position": metres, "orientation": {"x": x, "y": y, "z": z, "w": w}}
+    return {
+        "quaternion": ("poses.csv", None, {**place, "qw": w, "qx": x, "qy": y, "qz": z}),
+        "metres": ("poses.csv", None, {f"{key}_m": each for key, each in metres.items()} | kuka),
+        "KUKA": ("poses.csv", None, place | kuka),
+        "FANUC": ("poses.json", None, place | fanuc),
+        "ABB": ("poses.json", None, {**place, "q1": w, "q2": x, "q3": y, "q4": z}),
+        "UR": ("poses.csv", "rotvec", place | vector),
+        "turning axes": ("poses.csv", "XYZ", place | staubli),
+        "matrix": ("poses.json", None, {"matrix_mm": np.round(matrix, 4).tolist()}),
+        "ROS": ("poses.yaml", None, {"header": {"frame_id": "base_link"}, "pose": message}),
+        "ROS transform": (
+            "poses.yaml", None, {"transform": {"translation": metres, "rotation": message["orientation"]}}
+        ),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("form", list(forms()))
+def test_forms_of_robot_poses(tmp_path: Path, form: str) -> None:
+    from slrig.importers import read_robot_poses
+
+    name, rotation, row = forms()[form]
+    found = read_robot_poses(written(tmp_path / name, [row]), rotation)
+    np.testing.assert_allclose(found.poses[0, :3, 3], PLACE_MM, atol=1e-3)
+    np.testing.assert_allclose(found.poses[0, :3, :3], TURN.as_matrix(), atol=1e-4)
+    assert found.names == ("1",)
+    assert (found.euler is None) == (form not in ("metres", "KUKA", "FANUC", "turning axes"))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("412,-35,780,0,0,0,1\n", "expected a line of names"),
+        ("x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,1\n", "expected a position with its unit"),
+        ("x_mm,y_mm,z_mm\n1,2,3\n", "expected a rotation with its convention"),
+        ("x_mm,y_mm,z_mm,rx_deg,ry_deg,rz_deg\n1,2,3,0,0,9\n", "say which by --rotation"),
+        ("x_mm,y_mm,z_mm,qx,qy,qz,qw\n1,2,3,0,0,0,1.5\n", "expected a quaternion of length 1"),
+        ("x_mm,y_mm,z_mm,qx,qy,qz,qw\n1,2,,0,0,0,1\n", "position: expected 3 numbers"),
+        ("x_mm,y_mm,z_mm,qx,qy,qz,qw\n1,2,3,0,0,1\n", "rows as long"),
+        ("name,x_mm,y_mm,z_mm,qx,qy,qz,qw\na,1,2,3,0,0,0,1\na,1,2,3,0,0,0,1\n", "found 'a' twice"),
+        ("", "expected a line of names"),
+    ],
+)
+def test_ambiguous_poses_are_refused(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "poses.csv").write_text(text)
+    result = slrig("calibrate", "hand-eye", tmp_path / "poses.csv", tmp_path, "--kind", "fixed", "--output", "x.json")
+    assert words in refused(result)
+
+
+def test_poses_and_folders_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
+    made = cell(HandEyeKind.FIXED, 1, count=5)
+    robot, seen = files_of(made, tmp_path, "first")
+    other = write_csv(tmp_path / "other.csv", ("a", "b", "c"), made.seen.poses[:3])
+    words = refused(slrig("calibrate", "hand-eye", robot, other, "--kind", "fixed", "--output", tmp_path / "x.json"))
+    assert "expected a robot pose for each of 3 folders (a, b, c, …), found 5" in words
+    assert "--check FILE alone" in refused(slrig("calibrate", "hand-eye", robot, seen))
