@@ -25,6 +25,7 @@ from slrig.api import (
     calibration,
     events,
     files,
+    hand_eye,
     live,
     models,
     notices,
@@ -143,6 +144,7 @@ def bare_app() -> FastAPI:
         rig.examination_router,
         rig_file.router,
         calibration.router,
+        hand_eye.router,
         rig.health_router,
         rig.turntable_router,
         acceptance.router,
@@ -174,6 +176,7 @@ def create_app(service: Service, *, ring: KeyRing | None, cookie: str = "slrig_s
     # the body's size. FastAPI's own size limit would lie outside of all of them and answer in plain text.
     longer = {
         IMPORT_PATH: max(MOST_IMPORT_BYTES, settings.max_body_bytes),
+        **dict.fromkeys(hand_eye.PATHS, max(hand_eye.MOST_BYTES, settings.max_body_bytes)),
         "/model/shoot": max(scans.MOST_SCAN_BYTES, settings.max_body_bytes),
         "/scan": max(scans.MOST_SCAN_BYTES, settings.max_body_bytes),
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
@@ -29,10 +29,13 @@ from slrig.calibrate.store import (
     picture_name,
     plain,
     pose_of,
+    session_readings,
+    setting_of,
 )
-from slrig.calibration import DEFAULT_BOARD, Board, BoardKind, BoardShape
-from slrig.errors import ArtefactNotReadyError, CameraNotFoundError, ConfigError
+from slrig.calibration import DEFAULT_BOARD, Board, BoardKind, BoardShape, PoseObservation
+from slrig.errors import ArtefactNotReadyError, CalibrationStateError, CameraNotFoundError, ConfigError
 from slrig.jobs.records import JobState
+from slrig.model import Calibration
 from slrig.scan.plan import PatternPlan
 from slrig.schedule.scheduler import ScheduledBoard
 
@@ -520,6 +523,27 @@ def _accepted(
     body = pose_body(calibration_id, pose_of(job), cameras)
     response.headers["Location"] = body.links.self
     return body
+
+
+def observed_boards(
+    service: Service, session_id: UUID, numbers: Sequence[int] | None
+) -> tuple[list[PoseObservation], Board, Calibration]:
+    """What was read of poses of a session, None for all that were accepted, their board, and the calibration in use.
+
+    Raises CalibrationNotFoundError; ConfigError: there are no such poses; CalibrationStateError: none is in use.
+    """
+    record = service.calibrations.register.get(session_id)
+    board, (_, _, calibration) = setting_of(record).board, service.health.health()
+    if calibration is None:
+        message = "The rig has no calibration in use, by which poses of a board are known. Activate one first."
+        raise CalibrationStateError(message)
+    readings = session_readings(service.calibrations.store.folder(record.id))
+    accepted = dict(zip([pose.number for pose in record.accepted], readings, strict=True))
+    numbers = list(accepted) if numbers is None else numbers
+    if not set(numbers) <= set(accepted) or len(set(numbers)) < len(numbers):
+        message = f"poses: expected accepted poses of calibration {record.id}, each once, found {numbers}; there are "
+        raise ConfigError(message + (", ".join(map(str, accepted)) or "none"))
+    return [accepted[number].observation for number in numbers], board, calibration
 
 
 @router.get("/{calibration_id}/pose/{number}")

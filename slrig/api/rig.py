@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 from starlette.responses import StreamingResponse
 
-from slrig.api.calibration import BoardRequest, IfBusy
+from slrig.api.calibration import BoardRequest, IfBusy, observed_boards
 from slrig.api.events import Held
 from slrig.api.files import require_whole
 from slrig.api.problems import file_of, problems
@@ -43,7 +43,6 @@ from slrig.bundle import (
     turntable_record,
 )
 from slrig.calibrate.job import AxisJob, turntable_axis
-from slrig.calibrate.store import session_readings, setting_of
 from slrig.calibrate.verification import VerificationJob, health_svg
 from slrig.calibration import Board
 from slrig.calibration.health import THRESHOLDS, DriftEstimate, HealthState, PairFigures, Thresholds
@@ -52,7 +51,7 @@ from slrig.conformance import ConformanceJob
 from slrig.devices import CameraInfo, FoundDevice, Trigger
 from slrig.discovery import InstalledDriver, MissingLibrary, OtherSystem, installed_drivers
 from slrig.doctor import DoctorJob, Examination, LatencyJob, last_examination
-from slrig.errors import CalibrationError, CalibrationStateError, ConfigError, ScanStateError, SlrigError
+from slrig.errors import CalibrationError, ConfigError, ScanStateError, SlrigError
 from slrig.jobs.job import Job
 from slrig.jobs.manager import RigStatus
 from slrig.jobs.records import RIG_JOBS, JobKind, JobRecord, JobState, utc_now
@@ -604,26 +603,14 @@ def plot_turntable(service: Serving) -> Response:
 @turntable_router.post("/turntable/axis", responses=problems(404, 409, 503, 507))
 def calibrate_turntable(service: Serving, request: Annotated[AxisRequest, Body()]) -> AxisBody:
     """Calibrate the axis from poses of a board that stood on the turntable, by the calibration in use."""
-    record = service.calibrations.register.get(request.calibration)
-    board, (_, _, calibration) = setting_of(record).board, service.health.health()
-    if calibration is None:
-        message = "The rig has no calibration in use, by which poses of a board tell an axis. Activate one first."
-        raise CalibrationStateError(message)
-    numbers_of = [pose.number for pose in record.accepted]
-    readings = session_readings(service.calibrations.store.folder(record.id))
-    accepted = dict(zip(numbers_of, readings, strict=True))
-    numbers = numbers_of if request.poses is None else request.poses
-    missing = [str(number) for number in numbers if number not in accepted]
-    if missing or len(set(numbers)) < len(numbers):
-        message = f"poses: expected accepted poses of calibration {record.id}, each once, found {numbers}; there are "
-        raise ConfigError(message + (", ".join(map(str, accepted)) or "none"))
-    if request.angles_deg is not None and len(request.angles_deg) != len(numbers):
-        message = f"angles_deg: expected one for each of {len(numbers)} poses, found {len(request.angles_deg)}"
+    seen = observed_boards(service, request.calibration, request.poses)
+    if request.angles_deg is not None and len(request.angles_deg) != len(seen[0]):
+        message = f"angles_deg: expected one for each of {len(seen[0])} poses, found {len(request.angles_deg)}"
         raise ConfigError(message)
-    observed = [accepted[number].observation for number in numbers]
-    given = (observed, board, calibration, request.angles_deg)
-    found = service.worker.run(Task(turntable_axis, given, what="axis of the turntable"), within_s=REQUEST_WAIT_S)
-    turntable = service.turntable.put_axis(found.axis.measured_axis, source=AxisSource.BOARD, of=str(record.id))
+    task = Task(turntable_axis, (*seen, request.angles_deg), what="axis of the turntable")
+    found = service.worker.run(task, within_s=REQUEST_WAIT_S)
+    of = str(request.calibration)
+    turntable = service.turntable.put_axis(found.axis.measured_axis, source=AxisSource.BOARD, of=of)
     poses = [
         TurntablePose(
             name=name, residual_mm=left, angle_deg=found.angles_deg[name], error_deg=found.errors_deg.get(name)

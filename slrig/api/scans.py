@@ -11,6 +11,7 @@ from fastapi import APIRouter, Body, Path, Query, Response
 from pydantic import BaseModel, Field
 
 from slrig.api.files import ready_files
+from slrig.api.hand_eye import rig_in_base
 from slrig.api.problems import problems
 from slrig.api.schemas import (
     ListedScan,
@@ -29,7 +30,7 @@ from slrig.api.service import Cursor, IdempotencyKey, PageLength, Service, Servi
 from slrig.bundle import AwareMoment, PresetDocument, PresetName, SafeText, Strict
 from slrig.calibrate.verification import require_healthy
 from slrig.jobs.records import JobKind, JobRecord, JobState
-from slrig.model import MAX_MASK_CHARACTERS
+from slrig.model import MAX_MASK_CHARACTERS, MeshAxes
 from slrig.scan.exposure import proposed_exposures
 from slrig.scan.formats import PREVIEW, THUMBNAIL
 from slrig.scan.job import cancel_series as _cancel_series
@@ -51,7 +52,9 @@ def start_scan(
 ) -> ScanBody:
     """Start a scan. The answer comes at once; follow `links.events` for the rest."""
     preset = None if request.preset is None else service.presets.get(request.preset)
-    plan = scan_plan(request, service.scan_defaults, preset)
+    in_robots_axes = request.reconstruction.mesh_axes is MeshAxes.ROBOT
+    placed = rig_in_base(service, request.robot_pose, needed=in_robots_axes)
+    plan = scan_plan(request, service.scan_defaults, preset, placed)
     plan = replace(plan, turn_deg=request.turn_deg, turned_by=request.turned_by)
 
     def start(key: str | None) -> UUID:

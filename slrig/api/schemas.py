@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from datetime import datetime
 from pathlib import Path
@@ -26,6 +26,7 @@ from slrig.bundle import (
     CameraName,
     ExposureFactors,
     FreeText,
+    PoseEntry,
     PresetDocument,
     PresetName,
     RegionTable,
@@ -172,7 +173,8 @@ class ReconstructionRequest(Strict):
     mesh_axes: Annotated[MeshAxes, Field(strict=False)] | None = Field(
         default=None,
         description="axes of mesh.ply, points.ply, STL, OBJ and 3MF: x right, y up, z towards the rig, or those of the "
-        "calibration (x right, y down, z away), in which all other files and figures are. Default upright",
+        "calibration (x right, y down, z away), in which all other files and figures are; robot: the base of a robot, "
+        "by hand-eye calibration (PUT /hand-eye), of a single scan. Default upright",
     )
     uncalibrated: UncalibratedRequest | None = Field(
         default=None,
@@ -232,6 +234,9 @@ class ScanRequest(ShotRequest):
     turned_by: TurnedBy = Field(
         default="table", description="hand: somebody has turned the object to turn_deg already, and nothing moves"
     )
+    robot_pose: PoseEntry | None = Field(
+        default=None, description="of the flange in the robot's base, 4 x 4, mm, at this scan, where the rig is in hand"
+    )
     if_busy: Literal["reject", "queue"] = Field(
         default="reject", description="what to do while the rig is held: answer 409, or wait in line"
     )
@@ -260,8 +265,14 @@ def filled(body: type[Body], source: object, /, **others: Any) -> Body:
     return body.model_validate({**own, **others}, from_attributes=True)
 
 
-def scan_plan(request: ShotRequest, defaults: ScanDefaults, preset: PresetDocument | None = None) -> ScanPlan:
+def scan_plan(
+    request: ShotRequest,
+    defaults: ScanDefaults,
+    preset: PresetDocument | None = None,
+    rig_in_base: Sequence[Sequence[float]] | None = None,
+) -> ScanPlan:
     """The plan that a request means on a rig with these defaults. preset : the one that the request names.
+    rig_in_base : (4, 4), mm, the rig in a robot's base, where it is known.
 
     The rig file's exposure is no part of it: it is among the settings that each camera was opened with. Its bracket is,
     unless the request or the preset says how long to expose.
@@ -277,7 +288,10 @@ def scan_plan(request: ShotRequest, defaults: ScanDefaults, preset: PresetDocume
     exposing: BaseModel = request if any(getattr(request, key) is not None for key in EXPOSURE_KEYS) else usual
     return ScanPlan(
         patterns=pattern_plan(request.patterns, usual),
-        reconstruction=ReconstructionPlan(**_chosen(ReconstructionPlan, request.reconstruction, usual)),
+        reconstruction=ReconstructionPlan(
+            **_chosen(ReconstructionPlan, request.reconstruction, usual),
+            rig_in_base=None if rig_in_base is None else tuple(map(tuple, rig_in_base)),
+        ),
         **{key: getattr(exposing, key) for key in EXPOSURE_KEYS},
         colour=request.colour if request.colour is not None else usual.colour,
         coloured_light=bool(usual.coloured_light if request.coloured_light is None else request.coloured_light),

@@ -25,6 +25,7 @@ _SCOPES = {
     "exposure": KeyScope.SCAN,
     "calibration": KeyScope.CALIBRATE,
     "acceptance": KeyScope.CALIBRATE,
+    "hand-eye": KeyScope.CALIBRATE,
     "rig": KeyScope.CALIBRATE,
 }
 

@@ -439,6 +439,13 @@ class ScanDefaults(Strict):
         default=None, description="play white in red, green and blue too, for cameras without colour. Default: false"
     )
 
+    @field_validator("mesh_axes")
+    @classmethod
+    def _of_any_scan(cls, axes: MeshAxes | None) -> MeshAxes | None:
+        if axes is MeshAxes.ROBOT:
+            raise ValueError("expected upright or rig, found robot, which is asked for scan by scan; leave it out")
+        return axes
+
     @field_validator("exposure_factors")
     @classmethod
     def _refuse_two_brackets(cls, factors: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,9 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from slrig.bundle import FreeText, Strict, json_bytes, read_json_model, write_file
-from slrig.calibration import Board, find_balls, fit_sphere
-from slrig.errors import CalibrationError, PoseRefusedError, SlrigError
+from slrig.bundle import FreeText, PoseEntry, Strict, json_bytes, read_json_model, write_file
+from slrig.calibration import Board, PoseObservation, find_balls, fit_sphere
+from slrig.disk import storage_errors
+from slrig.errors import CalibrationError, CalibrationNotFoundError, PoseRefusedError, SlrigError
 from slrig.model import Calibration, FloatArray
 from slrig.scan.artefacts import MESH, decode_mesh_ply
 
@@ -25,8 +27,6 @@ _INDEPENDENT_POINTS = 100
 """Points of a sphere whose errors are taken to be independent: those of neighbours in a scan are alike."""
 _MAX_POSES = 1000
 
-Row = Annotated[list[float], Field(min_length=4, max_length=4)]
-Matrix = Annotated[list[Row], Field(min_length=4, max_length=4)]
 Covariance = Annotated[
     list[Annotated[list[float], Field(max_length=12)]],
     Field(max_length=12, description="of a small turn (x, y, z, rad) and the translation (mm)"),
@@ -45,7 +45,7 @@ class NextPose(Strict):
     """The pose that would tell most."""
 
     words: str
-    flange: Matrix = Field(description="of the flange in the base, mm")
+    flange: PoseEntry = Field(description="of the flange in the base, mm")
     sigma_mm: float = Field(description="deviation of the rig's place then, along its worst axis")
 
 
@@ -58,11 +58,11 @@ class HandEyeDocument(Strict):
     calibration: str | None = Field(description="the solve of the rig that it belongs to: its frame is the rig's")
     base_frame: FreeText = Field(default="base_link", description="name of the robot's base, for ROS")
     flange_frame: FreeText = Field(default="tool0", description="name of what the robot's poses are of, for ROS")
-    rig: Matrix = Field(description="rig to flange (in-hand) or to base (fixed)")
+    rig: PoseEntry = Field(description="rig to flange (in-hand) or to base (fixed)")
     covariance: Covariance
-    inverse: Matrix = Field(description="flange or base to rig")
+    inverse: PoseEntry = Field(description="flange or base to rig")
     inverse_covariance: Covariance
-    target: Matrix = Field(description="board to base (in-hand) or to flange (fixed); of a sphere, its centre")
+    target: PoseEntry = Field(description="board to base (in-hand) or to flange (fixed); of a sphere, its centre")
     joint_covariance: Covariance = Field(
         description="of rig and target together; of a sphere's centre, its place alone"
     )
@@ -162,15 +162,12 @@ def seen_boards(
     Raises PoseRefusedError if none can be used; CalibrationError: the calibration is of other cameras.
     """
     from slrig.calibrate.pose_reading import read_pose
-    from slrig.calibration.hand_eye import TargetPoses
-    from slrig.calibration.health.drift import estimate_board_poses
 
     def observed(name: str) -> Any:
         return read_pose(bundles[name], board, name).observation
 
     chosen, poses, refused = _each_read(robot, observed, report)
-    boards = estimate_board_poses(poses, board, calibration)
-    return SeenTargets(robot.select(chosen), TargetPoses(boards.names, boards.poses, boards.covariance), refused)
+    return SeenTargets(robot.select(chosen), _posed(poses, board, calibration), refused)
 
 
 def seen_spheres(
@@ -234,3 +231,86 @@ def paired(robot: RobotPoses, folders: Mapping[str, Path]) -> RobotPoses:
         f"{len(robot.names)} ({', '.join(robot.names[:3])}, …): name each pose as its folder, in a column 'name'"
     )
     raise CalibrationError(message)
+
+
+class HandEyeStore:
+    """Hand-eye calibrations of a data folder, DATA/hand_eye: one for each calibration of the rig, in its frame."""
+
+    def __init__(self, root: Path) -> None:
+        self._folder = root / "hand_eye"
+
+    def get(self, calibration: str) -> HandEyeDocument:
+        """The one for a calibration, by its identifier. Raises CalibrationNotFoundError, CalibrationError."""
+        path = self._path(calibration)
+        if not path.is_file():
+            message = (
+                f"There is no hand-eye calibration for calibration {calibration}, which is in use: POST /hand-eye, or "
+                "slrig calibrate hand-eye and PUT /hand-eye."
+            )
+            raise CalibrationNotFoundError(message)
+        return read_hand_eye(path)
+
+    def put(self, document: HandEyeDocument) -> None:
+        """Keep one in place of the last. Raises StorageError."""
+        with storage_errors(self._folder):
+            self._folder.mkdir(exist_ok=True)
+        write_hand_eye(self._path(str(document.calibration)), document)
+
+    def remove(self, calibration: str) -> None:
+        """Idempotent. Raises StorageError."""
+        with storage_errors(self._folder):
+            self._path(calibration).unlink(missing_ok=True)
+
+    def _path(self, calibration: str) -> Path:
+        # Identifiers of imported calibrations are any text.
+        return self._folder / f"{hashlib.sha256(calibration.encode()).hexdigest()[:16]}.json"
+
+
+# Short tasks of the worker
+
+
+def solved_poses(
+    observations: Sequence[PoseObservation],
+    board: Board,
+    calibration: Calibration,
+    robot: Sequence[Any],
+    options: Mapping[str, Any],
+) -> HandEyeDocument:
+    """Solve by poses of a board and of a robot. options : of a request."""
+    from slrig.calibration.hand_eye import HandEyeKind, solve_hand_eye
+
+    seen = _posed(observations, board, calibration)
+    found = solve_hand_eye(
+        _of_robot(seen, robot), seen, HandEyeKind(options["kind"]), robot_sigma=options["robot_sigma"]
+    )
+    frames = {key: options[key] for key in ("base_frame", "flange_frame")}
+    return hand_eye_document(found, calibration.solve_id, **frames)
+
+
+def checked_poses(
+    observations: Sequence[PoseObservation],
+    board: Board,
+    calibration: Calibration,
+    robot: Sequence[Any],
+    document: HandEyeDocument,
+) -> dict[str, Any]:
+    """What poses of a board and of a robot say of a hand-eye calibration."""
+    from slrig.calibration.hand_eye import check_hand_eye
+
+    seen = _posed(observations, board, calibration)
+    drift = check_hand_eye(hand_eye_of(document), _of_robot(seen, robot), seen)
+    return {**drift._asdict(), "holds": drift.holds, "residual_mm": drift.residual_mm.tolist()}
+
+
+def _posed(observations: Sequence[PoseObservation], board: Board, calibration: Calibration) -> TargetPoses:
+    """The board's poses. Raises CalibrationError: the calibration is of other cameras."""
+    from slrig.calibration.hand_eye import TargetPoses
+    from slrig.calibration.health.drift import estimate_board_poses
+
+    return TargetPoses(*estimate_board_poses(observations, board, calibration))
+
+
+def _of_robot(seen: TargetPoses, robot: Sequence[Any]) -> RobotPoses:
+    from slrig.calibration.hand_eye import RobotPoses
+
+    return RobotPoses(seen.names, np.array(robot))

@@ -398,6 +398,7 @@ def scan(
             cross_lines=cross_lines or None,
         ),
         reconstruction={**mesh.asked(), **given(uncalibrated=guesses.asked())},
+        robot_pose=mesh.flange(),
     )  # fmt: skip
     files = tuple(file or FILES)
     if asked.budget_s is not None and not asked.assist:
@@ -434,6 +435,9 @@ def reconstruct(
     ] = None,
     mesh: MeshOptions,
     guesses: GuessOptions,
+    hand_eye: Annotated[
+        Path | None, typer.Option(help="With --mesh-axes robot: hand_eye.json, by slrig calibrate hand-eye.")
+    ] = None,
     decode_only: Annotated[
         bool,
         typer.Option("--decode-only", help="Only decode: positions, causes, what to change. Needs no calibration."),
@@ -446,8 +450,13 @@ def reconstruct(
     if decode_only:
         decode_and_tell(bundles, output)
         return
+    options = mesh.chosen()
+    if hand_eye is not None:
+        from slrig.calibrate.hand_eye import read_hand_eye
+
+        options["rig_in_base"] = read_hand_eye(hand_eye).rig_in_base(mesh.flange()).tolist()
     reconstruct_and_tell(
-        bundles, output, calibration=calibration, further=file or (), options=mesh.chosen(), guess=guesses.asked()
+        bundles, output, calibration=calibration, further=file or (), options=options, guess=guesses.asked()
     )
 
 

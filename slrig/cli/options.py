@@ -14,7 +14,7 @@ import typer
 import typer.core
 
 from slrig import KEY_VARIABLE
-from slrig.errors import ConfigError, SlrigError
+from slrig.errors import CalibrationError, ConfigError, SlrigError
 from slrig.examples import rig_path
 
 if TYPE_CHECKING:
@@ -205,7 +205,13 @@ class MeshOptions:
     ] = None
     mesh_axes: Annotated[
         str | None,
-        typer.Option(help="Axes of PLY, STL, OBJ, 3MF: upright, for viewers (default), or rig, the calibration's."),
+        typer.Option(
+            help="Axes of PLY, STL, OBJ, 3MF: upright, for viewers (default), rig, the calibration's, or robot."
+        ),
+    ] = None
+    robot_pose: Annotated[
+        Path | None,
+        typer.Option(help="File with the flange's pose at this scan, of a rig in hand: see slrig calibrate hand-eye."),
     ] = None
 
     def asked(self) -> dict[str, Any]:
@@ -213,13 +219,26 @@ class MeshOptions:
         from slrig.bundle import read_region
 
         region = None if self.region is None else read_region(self.region).model_dump(mode="json", exclude_unset=True)
-        return given(**{**asdict(self), "region": region})
+        return given(**{**asdict(self), "region": region, "robot_pose": None})
 
     def chosen(self) -> dict[str, Any]:
         """What was given, as a plan has it. Raises ConfigError: the file of the region is wrong."""
         from slrig.bundle import read_region
 
-        return given(**{**asdict(self), "region": None if self.region is None else read_region(self.region).region()})
+        region = None if self.region is None else read_region(self.region).region()
+        return given(**{**asdict(self), "region": region, "robot_pose": None})
+
+    def flange(self) -> list[list[float]] | None:
+        """The flange's pose, 4 x 4, mm. Raises CalibrationError: the file has none, or several."""
+        if self.robot_pose is None:
+            return None
+        from slrig.importers import read_robot_poses
+
+        poses = read_robot_poses(self.robot_pose).poses.tolist()
+        if len(poses) != 1:
+            message = f"--robot-pose {self.robot_pose}: expected one pose, that of this scan, found {len(poses)}"
+            raise CalibrationError(message)
+        return list(poses[0])
 
 
 @dataclass(frozen=True, slots=True)

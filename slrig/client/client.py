@@ -24,6 +24,7 @@ from slrig.client.resources import (
     Acceptance,
     CalibrationResource,
     Examinations,
+    HandEyeResource,
     IfBusy,
     Models,
     Notices,
@@ -313,8 +314,13 @@ def _read_mesh(ply: bytes) -> trimesh.Trimesh:
     for name in ("sigma_mm", "stripe", "albedo_mark"):
         mesh.vertex_attributes[name] = stored[name].reshape(-1)
     mesh.units = "mm"
-    if b"\ncomment axes x right, y up," in ply[: ply.find(b"\nend_header")]:
+    head = ply[: ply.find(b"\nend_header")].decode("ascii", "replace")
+    axes = next((line for line in head.split("\n") if line.startswith("comment axes ")), "")
+    if axes.startswith("comment axes x right, y up,"):
         mesh.apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))
+    elif axes.startswith("comment axes those of the robot's base"):
+        pose = np.vstack([np.array(axes.split()[-12:], dtype=np.float64).reshape(3, 4), (0, 0, 0, 1)])
+        mesh.apply_transform(np.linalg.inv(pose))
     return mesh
 
 
@@ -349,6 +355,7 @@ class Client:
         self.calibration = CalibrationResource(self.connection)
         self.health = RigHealth(self.connection)
         self.turntable = TurntableResource(self.connection)
+        self.hand_eye = HandEyeResource(self.connection)
         self.accept = Acceptance(self.connection)
         self.schedules = Schedules(self.connection)
         self.notices = Notices(self.connection)
@@ -369,6 +376,7 @@ class Client:
         coloured_light: bool | None = None,
         turn_deg: float | None = None,
         turned_by: str | None = None,
+        robot_pose: Sequence[Sequence[float]] | None = None,
         if_busy: IfBusy | None = "queue",
         repeat: int | None = None,
         every_s: float | None = None,
@@ -393,6 +401,8 @@ class Client:
             Take the colour of the surface by a colour camera; by red, green and blue light.
         turn_deg, turned_by
             The angle of the turntable, in degrees, and what turns it, "table" or "hand".
+        robot_pose
+            Of the robot's flange in its base, 4 x 4, mm, for {"mesh_axes": "robot"} of a rig in its hand.
         if_busy
             "queue": wait while the rig is held; "reject": fail. None: as the service is set up.
         repeat, every_s
@@ -419,6 +429,7 @@ class Client:
             coloured_light=coloured_light,
             turn_deg=turn_deg,
             turned_by=turned_by,
+            robot_pose=robot_pose,
             if_busy=if_busy,
             repeat=repeat,
             every_s=every_s,
@@ -446,6 +457,7 @@ class Client:
         coloured_light: bool | None = None,
         turn_deg: float | None = None,
         turned_by: str | None = None,
+        robot_pose: Sequence[Sequence[float]] | None = None,
         if_busy: IfBusy | None = "queue",
         repeat: int | None = None,
         every_s: float | None = None,
@@ -463,6 +475,7 @@ class Client:
             coloured_light=coloured_light,
             turn_deg=turn_deg,
             turned_by=turned_by,
+            robot_pose=robot_pose,
             if_busy=if_busy,
             repeat=repeat,
             every_s=every_s,

@@ -33,6 +33,7 @@ class ScanFields(TypedDict, total=False):
     coloured_light: bool | None
     turn_deg: float | None
     turned_by: str | None
+    robot_pose: Sequence[Sequence[float]] | None
     if_busy: IfBusy | None
     repeat: int | None
     every_s: float | None
@@ -567,6 +568,45 @@ class RigHealth(Resource):
     def follow(self, verification_id: str) -> Iterator[Event]:
         """The events of a verification, from the first to the last, as they happen."""
         return self._connection.follow(path("/rig/verification/{}/events", verification_id))
+
+
+class HandEyeResource(Resource):
+    """Where the rig is on a robot or before it, kept with the calibration in use."""
+
+    def get(self) -> Json:
+        """Where it is, with covariances and residuals."""
+        return self._connection.json("GET", "/hand-eye")
+
+    def put(self, document: Mapping[str, Any] | str | bytes) -> Json:
+        """Keep a hand_eye.json."""
+        return self._connection.json("PUT", "/hand-eye", **document_body(document))
+
+    def delete(self) -> None:
+        """Forget it."""
+        self._connection.send("DELETE", "/hand-eye")
+
+    def solve(
+        self,
+        calibration: str,
+        poses: Sequence[Mapping[str, Any]],
+        *,
+        kind: str,
+        robot_sigma: Sequence[float] | None = None,
+        base_frame: str | None = None,
+        flange_frame: str | None = None,
+    ) -> Json:
+        """Find it from poses of a session: {"pose": its number, "robot_pose": the flange in the base, 4 x 4, mm} each.
+
+        kind : "in-hand" or "fixed".
+        """
+        options = given(robot_sigma=robot_sigma, base_frame=base_frame, flange_frame=flange_frame)
+        request = {"calibration": calibration, "poses": list(poses), "kind": kind, **options}
+        return self._connection.json("POST", "/hand-eye", json=request)
+
+    def check(self, calibration: str, poses: Sequence[Mapping[str, Any]]) -> Json:
+        """Hold new poses, as for `solve`, against what is kept."""
+        request = {"calibration": calibration, "poses": list(poses)}
+        return self._connection.json("POST", "/hand-eye/check", json=request)
 
 
 class TurntableResource(Resource):

@@ -8,6 +8,7 @@ DATA/scans/ID/       a finished scan: bundle/, mesh.ply, report.json ..., and fi
 DATA/calibrations/   calibrations and their sessions: see `slrig.calibrate.store`
 DATA/acceptance/     acceptance tests: see `slrig.accept.store`
 DATA/models/         models of several scans: see `slrig.model_jobs.job`
+DATA/hand_eye/       where the rig is on a robot: see `slrig.calibrate.hand_eye`
 DATA/presets/NAME.json  presets that were put: see `slrig.scan.plan`
 DATA/webhook.json    the webhook that was set by request: see `slrig.schedule.notices`
 DATA/clock.json      the time that ages are reckoned by: see `slrig.jobs.retention`

@@ -24,10 +24,12 @@ class MeshAxes(StrEnum):
 
     UPRIGHT : x right, y up, z towards the rig, as viewers and CAD programs have them: (x, -y, -z) of the calibration.
     RIG : those of the calibration, x right, y down, z away from the rig; for robots, and to compare with other data.
+    ROBOT : those of the base of a robot, where hand-eye calibration says where the rig is in it.
     """
 
     UPRIGHT = "upright"
     RIG = "rig"
+    ROBOT = "robot"
 
 
 def linear_to_srgb(light: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:

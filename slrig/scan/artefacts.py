@@ -10,12 +10,12 @@ import json
 import math
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass, replace
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,15 +39,7 @@ ON_REQUEST: Mapping[str, Callable[[Mesh], bytes]] = {
 }
 """Files that are made of mesh.ply, and only when somebody wants them."""
 
-_TURNS = {
-    MeshAxes.UPRIGHT: np.array([1, -1, -1], dtype=np.float32),
-    MeshAxes.RIG: np.ones(3, dtype=np.float32),
-}
-"""Factors by which coordinates of the calibration's axes become those of a file, and back."""
-_AXES_WORDS = {
-    MeshAxes.UPRIGHT: "comment axes x right, y up, z towards the rig: those of the calibration are (x, -y, -z)",
-    MeshAxes.RIG: "comment axes those of the calibration",
-}
+_ROBOT_WORDS = "comment axes those of the robot's base: [R t] (x, y, z, 1) of those of the calibration, by rows"
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 _END_OF_HEADER = b"\nend_header\n"
 _CALIBRATION_PART = "sigma_calibration_mm"
@@ -86,9 +78,8 @@ def converted(ply: bytes, name: str) -> bytes:
     as slrig wrote it.
     """
     mesh, axes = decode_mesh_ply(ply), _axes_of(ply)
-    if axes is not MeshAxes.RIG and not name.endswith(".glb"):
-        turn = _TURNS[axes]
-        mesh = replace(mesh, vertices_mm=mesh.vertices_mm * turn, normals=mesh.normals * turn)
+    if not name.endswith(".glb"):
+        mesh = replace(mesh, vertices_mm=axes.points(mesh.vertices_mm), normals=axes.normals(mesh.normals))
     return ON_REQUEST[name](mesh)
 
 
@@ -109,12 +100,53 @@ def encode_report(report: Mapping[str, object]) -> bytes:
     return (text + "\n").encode()
 
 
+class FileAxes(NamedTuple):
+    """Axes of a file. words : that state them in a PLY; pose : (4, 4) float64, of the calibration's axes in them."""
+
+    words: str
+    pose: FloatArray
+
+    @classmethod
+    def of(cls, axes: MeshAxes, rig_in_base: Sequence[Sequence[float]] | None = None) -> FileAxes:
+        """The axes of a plan. rig_in_base : (4, 4), mm, which those of a robot need."""
+        if axes is MeshAxes.ROBOT:
+            pose = np.array(rig_in_base, dtype=np.float64)
+            return cls(" ".join([_ROBOT_WORDS, *map(repr, pose[:3].ravel().tolist())]), pose)
+        if axes is MeshAxes.RIG:
+            return cls("comment axes those of the calibration", np.eye(4))
+        words = "comment axes x right, y up, z towards the rig: those of the calibration are (x, -y, -z)"
+        return cls(words, np.diag([1.0, -1.0, -1.0, 1.0]))
+
+    @property
+    def inverse(self) -> FileAxes:
+        """Back from them."""
+        return FileAxes("", np.asarray(np.linalg.inv(self.pose)))
+
+    def points(self, points_mm: NDArray[Any]) -> NDArray[Any]:
+        """Points (n, 3) of the calibration's axes in those of the file."""
+        shift = self.pose[:3, 3]
+        if not shift.any():
+            return self.normals(points_mm)
+        # In doubles: a robot is a metre away.
+        return np.asarray((points_mm @ self.pose[:3, :3].T + shift).astype(points_mm.dtype))
+
+    def normals(self, normals: NDArray[Any]) -> NDArray[Any]:
+        """Directions (n, 3) of the calibration's axes in those of the file."""
+        turn = self.pose[:3, :3]
+        if (turn == np.diag(np.diagonal(turn))).all():
+            return np.asarray(normals * np.diagonal(turn).astype(normals.dtype))
+        return np.asarray((normals @ turn.T).astype(normals.dtype))
+
+
+UPRIGHT = FileAxes.of(MeshAxes.UPRIGHT)
+
+
 def encode_mesh_ply(
     mesh: Mesh,
     *,
     sigma_calibration_mm: FloatArray | None = None,
     views: IntArray | None = None,
-    axes: MeshAxes = MeshAxes.UPRIGHT,
+    axes: FileAxes = UPRIGHT,
 ) -> bytearray:
     """Binary little-endian PLY in mm: position, normal, colour, `albedo_mark`, `sigma_mm`, `stripe` per vertex;
     triangles.
@@ -124,7 +156,7 @@ def encode_mesh_ply(
     where the calibration does not state it. views : (V,), of how many views each vertex is the mean, one property more.
     axes : of the file; `mesh` is in those of the calibration.
     """
-    properties = {**_vertex_properties(mesh, _TURNS[axes]), **_further(sigma_calibration_mm, views)}
+    properties = {**_vertex_properties(mesh, axes), **_further(sigma_calibration_mm, views)}
     kind = _record(properties)
     header = _ply_header(_mesh_elements(kind, len(mesh.vertices_mm), len(mesh.faces)), axes)
     data, (vertices, faces) = _room(header, (kind, len(mesh.vertices_mm)), (_FACE, len(mesh.faces)))
@@ -147,7 +179,8 @@ def decode_mesh_ply(data: bytes | bytearray) -> Mesh:
     counts = [int(count) for count in re.findall(rb"^element \w+ (\d{1,12})$", head, re.MULTILINE)]
     stated, views = (_NONE if f" {name}\n".encode() in head else None for name in (_CALIBRATION_PART, _VIEWS))
     axes = _axes_of(data)
-    kind = _record({**_vertex_properties(_NO_MESH, _TURNS[axes]), **_further(stated, views)})
+    back = axes.inverse
+    kind = _record({**_vertex_properties(_NO_MESH, axes), **_further(stated, views)})
     vertex_count, face_count = counts if len(counts) == 2 else (0, 0)
     vertex_bytes = vertex_count * kind.itemsize
     length = vertex_bytes + face_count * _FACE.itemsize
@@ -165,9 +198,9 @@ def decode_mesh_ply(data: bytes | bytearray) -> Mesh:
         message = "mesh.ply: a triangle names a vertex that is not there; reconstruct the bundle again"
         raise InvalidInputError(message)
     return Mesh(
-        vertices_mm=np.stack([vertices[name] for name in ("x", "y", "z")], axis=1) * _TURNS[axes],
+        vertices_mm=back.points(np.stack([vertices[name] for name in ("x", "y", "z")], axis=1)),
         faces=np.ascontiguousarray(faces),
-        normals=np.stack([vertices[name] for name in ("nx", "ny", "nz")], axis=1) * _TURNS[axes],
+        normals=back.normals(np.stack([vertices[name] for name in ("nx", "ny", "nz")], axis=1)),
         colour=np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1),
         mark=np.ascontiguousarray(vertices[_MARK]),
         sigma_mm=np.ascontiguousarray(vertices["sigma_mm"]),
@@ -175,17 +208,24 @@ def decode_mesh_ply(data: bytes | bytearray) -> Mesh:
     )
 
 
-def _axes_of(ply: bytes | bytearray) -> MeshAxes:
+def _axes_of(ply: bytes | bytearray) -> FileAxes:
     """Axes that the header of a PLY states; those of the calibration in files of earlier versions."""
     head, _, _ = ply.partition(_END_OF_HEADER)
-    stated = f"\n{_AXES_WORDS[MeshAxes.UPRIGHT]}\n".encode() in head
-    return MeshAxes.UPRIGHT if stated else MeshAxes.RIG
+    lines = head.decode("ascii", "replace").split("\n")
+    robot = next((line.removeprefix(_ROBOT_WORDS).split() for line in lines if line.startswith(_ROBOT_WORDS)), None)
+    if robot is not None:
+        with suppress(ValueError):
+            pose = np.vstack([np.array(robot, dtype=np.float64).reshape(3, 4), (0.0, 0.0, 0.0, 1.0)])
+            # A damaged header is refused: it is not as it would be written again.
+            if np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-6):
+                return FileAxes.of(MeshAxes.ROBOT, pose.tolist())
+    return UPRIGHT if UPRIGHT.words in lines else FileAxes.of(MeshAxes.RIG)
 
 
-def _vertex_properties(mesh: Mesh, turn: NDArray[np.float32]) -> dict[str, tuple[str, NDArray[Any]]]:
+def _vertex_properties(mesh: Mesh, axes: FileAxes) -> dict[str, tuple[str, NDArray[Any]]]:
     return {
-        **_columns(("x", "y", "z"), "f4", mesh.vertices_mm * turn),
-        **_columns(("nx", "ny", "nz"), "f4", mesh.normals * turn),
+        **_columns(("x", "y", "z"), "f4", axes.points(mesh.vertices_mm)),
+        **_columns(("nx", "ny", "nz"), "f4", axes.normals(mesh.normals)),
         **_columns(("red", "green", "blue"), "u1", mesh.colour),
         _MARK: ("u1", mesh.mark),
         "sigma_mm": ("f4", mesh.sigma_mm),
@@ -215,7 +255,7 @@ def encode_points_ply(
     normals: NDArray[np.float32],
     *,
     sigma_calibration_mm: FloatArray | None = None,
-    axes: MeshAxes = MeshAxes.UPRIGHT,
+    axes: FileAxes = UPRIGHT,
 ) -> bytearray:
     """Binary little-endian PLY in mm: position, normal, colour, `albedo_mark`, `sigma_mm`, `stripe`, `source`,
     `bridge_after` per point.
@@ -226,8 +266,8 @@ def encode_points_ply(
     """
     columns = np.floor(curves.column_px).astype(np.int32)
     properties = {
-        **_columns(("x", "y", "z"), "f4", curves.points_mm * _TURNS[axes]),
-        **_columns(("nx", "ny", "nz"), "f4", normals * _TURNS[axes]),
+        **_columns(("x", "y", "z"), "f4", axes.points(curves.points_mm)),
+        **_columns(("nx", "ny", "nz"), "f4", axes.normals(normals)),
         **_columns(("red", "green", "blue"), "u1", curves.colour),
         _MARK: ("u1", curves.mark),
         "sigma_mm": ("f4", curves.sigma_mm),
@@ -276,10 +316,10 @@ def _vertex_element(vertex: np.dtype[np.void], count: int) -> list[str]:
     return [f"element vertex {count}", *properties]
 
 
-def _ply_header(elements: list[str], axes: MeshAxes | None) -> bytes:
+def _ply_header(elements: list[str], axes: FileAxes | None) -> bytes:
     """Return the header of a PLY. axes : None as an earlier version wrote it, which did not state them."""
     comments = ["comment unit mm", "comment sigma_mm standard deviation along the surface normal"]
-    stated = [] if axes is None else [_AXES_WORDS[axes]]
+    stated = [] if axes is None else [axes.words]
     lines = ["ply", "format binary_little_endian 1.0", *comments, *stated, *elements]
     return "\n".join(lines).encode("ascii") + _END_OF_HEADER
 

@@ -186,12 +186,14 @@ class ReconstructionPlan:
     mesh_axes : of mesh.ply, points.ply, STL, OBJ and 3MF, `MeshAxes` or its value. All other files and figures are in
     the axes of the calibration; GLB has axes of its own.
     uncalibrated : calibrate the rig by the scan itself, from these guesses; None uses the rig's calibration.
+    rig_in_base : (4, 4), mm, the rig in a robot's base by
+    hand-eye calibration, None where it is not known.
 
     Raises
     ------
     ConfigError
         depth_edge_ratio is not above 1 and finite, max_code_gap is below 1, flip_rule is none of `FlipRule`, axis none
-        of `Axis`, mesh_axes none of `MeshAxes`, or drop_finest_bits below 0.
+        of `Axis`, mesh_axes none of `MeshAxes`, or robot without rig_in_base, or drop_finest_bits below 0.
     """
 
     keep_holes: bool = False
@@ -204,6 +206,7 @@ class ReconstructionPlan:
     drop_finest_bits: int = 0
     mesh_axes: MeshAxes = MeshAxes.UPRIGHT
     uncalibrated: RigGuess | None = None
+    rig_in_base: tuple[tuple[float, ...], ...] | None = None
 
     def __post_init__(self) -> None:
         if not 1 < self.depth_edge_ratio < math.inf:
@@ -234,6 +237,14 @@ class ReconstructionPlan:
         except ValueError as cause:
             message = f"mesh_axes: expected {' or '.join(MeshAxes)}, found {self.mesh_axes!r}; upright is usual"
             raise ConfigError(message) from cause
+        if self.mesh_axes is MeshAxes.ROBOT and self.rig_in_base is None:
+            message = (
+                "mesh_axes: robot needs to know where the rig is in the robot's base; calibrate that (slrig calibrate "
+                "hand-eye), and ask for it scan by scan: neither rig files, presets, schedules nor models can"
+            )
+            raise ConfigError(message)
+        if self.rig_in_base is not None:
+            object.__setattr__(self, "rig_in_base", tuple(map(tuple, self.rig_in_base)))
         try:
             object.__setattr__(self, "axis", None if self.axis is None else Axis(self.axis))
         except ValueError as cause:

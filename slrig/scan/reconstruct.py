@@ -86,6 +86,7 @@ from slrig.scan.artefacts import (
     MESH,
     REPORT,
     REPORT_FORMAT,
+    FileAxes,
     encode_mesh_ply,
     encode_points_ply,
     encode_report,
@@ -267,6 +268,7 @@ def reconstruct_into(
         The disk refused.
     """
     watch = Stopwatch() if live is None else live.watch
+    axes = FileAxes.of(plan.mesh_axes, plan.rig_in_base)
 
     at = ("", 0.0, "")
 
@@ -304,14 +306,14 @@ def reconstruct_into(
         require_coverage(bundle, cameras, covered)
         entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")
         # One at a time: each is as large as the mesh.
-        place(MESH, encode_mesh_ply(mesh, sigma_calibration_mm=meshed.mesh_calibration_sigma_mm, axes=plan.mesh_axes))
+        place(MESH, encode_mesh_ply(mesh, sigma_calibration_mm=meshed.mesh_calibration_sigma_mm, axes=axes))
         # The mesh is what somebody waits for; what is left is shared by two threads.
         pictures = beside.submit(_encoded_pictures, mesh, cameras)
         place("mesh.glb", encode_mesh_glb(mesh))
         place(
             "points.ply",
             encode_points_ply(
-                meshed.curves, meshed.normals, sigma_calibration_mm=meshed.calibration_sigma_mm, axes=plan.mesh_axes
+                meshed.curves, meshed.normals, sigma_calibration_mm=meshed.calibration_sigma_mm, axes=axes
             ),
         )
         sizes = mesh_figures(mesh.vertices_mm, mesh.faces)

@@ -15,12 +15,13 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from slrig.bundle import write_calibration
-from slrig.calibrate.hand_eye import read_hand_eye
-from slrig.calibration import BoardPose
-from slrig.calibration.hand_eye import HandEyeKind
+from slrig.bundle import write_bundle, write_calibration
+from slrig.calibrate.hand_eye import hand_eye_document, read_hand_eye, write_hand_eye
+from slrig.calibration import PROJECTOR, BoardPose
+from slrig.calibration.hand_eye import HandEyeKind, solve_hand_eye
 from slrig.model import Calibration, FloatArray
-from slrig.scan.artefacts import encode_mesh_ply
+from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply
+from slrig.scan.preparation import sample_scan
 from tests.unit.calibration.posed_boards import CHESSBOARD, Shooting, two_cameras_and_projector
 from tests.unit.calibration.robot_cells import RobotCell, cell, error_of, pose
 from tests.unit.command import done, refused, slrig
@@ -78,7 +79,8 @@ def test_boards_in_bundles_are_paired_with_poses(
     made = cell(
         HandEyeKind.FIXED, 6, count=8, turns_deg=(25.0, 25.0, 20.0), spread_mm=15.0, place_mm=(20.0, -45.0, 600.0)
     )
-    devices = two_cameras_and_projector()
+    # Two cameras tell a pose, and take less time than the projector's light.
+    devices = {name: each for name, each in two_cameras_and_projector().items() if name != PROJECTOR}
     shooting = Shooting(CHESSBOARD, devices)
     shot = {
         name: shooting.shot(name, BoardPose(each[:3, :3], each[:3, 3]))
@@ -89,7 +91,7 @@ def test_boards_in_bundles_are_paired_with_poses(
         return SimpleNamespace(observation=shot[name])
 
     monkeypatch.setattr("slrig.calibrate.pose_reading.read_pose", read_pose)
-    calibration = Calibration({name: devices[name] for name in ("left", "right")}, devices["projector"])
+    calibration = Calibration(devices, None)
     for name in made.robot.names:
         (tmp_path / "poses" / name / "bundle").mkdir(parents=True)
         (tmp_path / "poses" / name / "bundle" / "bundle.json").write_text("{}")
@@ -130,6 +132,26 @@ def test_spheres_in_scans_are_found(tmp_path: Path) -> None:
     error = error_of(np.array(found.rig), made.rig)
     assert np.all(np.abs(error) < 4 * np.sqrt(np.diagonal(found.covariance)))
     assert found.poses[0].residual_deg is None
+
+
+def test_recorded_scan_is_written_in_the_robots_axes(tmp_path: Path) -> None:
+    write_bundle(tmp_path / "scan", *sample_scan())
+    made = cell(HandEyeKind.IN_HAND, 4)
+    found = hand_eye_document(solve_hand_eye(made.robot, made.seen, made.kind), None)
+    write_hand_eye(tmp_path / "hand_eye.json", found)
+    flange = write_csv(tmp_path / "flange.csv", ("now",), made.robot.poses[:1])
+    words = ["reconstruct", tmp_path / "scan", "--mesh-axes", "robot", "--hand-eye", tmp_path / "hand_eye.json"]
+    assert "give robot_pose" in refused(slrig(*words, "--output", tmp_path / "none"))
+    done(*words, "--robot-pose", flange, "--output", tmp_path / "base")
+    done("reconstruct", tmp_path / "scan", "--mesh-axes", "rig", "--output", tmp_path / "rig")
+    for name in ("mesh.ply", "points.ply"):
+        base, rig = (trimesh.load(tmp_path / place / name, process=False).vertices for place in ("base", "rig"))
+        placed = made.robot.poses[0] @ np.array(found.rig)
+        np.testing.assert_allclose(base, rig @ placed[:3, :3].T + placed[:3, 3], atol=1e-3)
+    base, rig = (decode_mesh_ply((tmp_path / place / "mesh.ply").read_bytes()).vertices_mm for place in ("base", "rig"))
+    np.testing.assert_allclose(base, rig, atol=1e-3)
+    report = json.loads((tmp_path / "base" / "report.json").read_text())
+    np.testing.assert_allclose(np.array(report["plan"]["rig_in_base"]), placed)
 
 
 TURN = Rotation.from_euler("ZYX", [30.0, -20.0, 75.0], degrees=True)

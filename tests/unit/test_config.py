@@ -82,7 +82,7 @@ def test_scan_defaults_are_the_fields_of_a_plan() -> None:
     plan = {field.name for part in (PatternPlan, ReconstructionPlan, ScanPlan) for field in fields(part)}
     # A pose may be shot without codes, a scan may not; a request makes a series, names a preset and turns a stage, no
     # rig file.
-    of_requests = {"series", "preset", "turn_deg", "turned_by"}
+    of_requests = {"series", "preset", "turn_deg", "turned_by", "rig_in_base"}
     assert set(ScanDefaults.model_fields) == plan - {"patterns", "reconstruction", "codes"} - of_requests
 
 

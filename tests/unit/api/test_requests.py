@@ -211,6 +211,7 @@ def test_plan_is_the_request_over_the_rig_file_over_the_default(client: TestClie
         "drop_finest_bits": 0,
         "mesh_axes": "upright",
         "uncalibrated": None,
+        "rig_in_base": None,
     }
     assert planned({"reconstruction": {"uncalibrated": {"focal_px": {"cam0": 900}}}}).patterns.rows
     # The rig file's exposure belongs to its cameras, not to the plan.

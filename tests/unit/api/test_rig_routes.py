@@ -14,7 +14,7 @@ from fastapi.testclient import TestClient
 
 from slrig.accept.plan import AcceptanceRequest
 from slrig.api import acceptance as router_module
-from slrig.api import rig
+from slrig.api import calibration, rig
 from slrig.calibrate.store import PoseRecord, SessionRecord
 from slrig.calibrate.verification import HealthStore
 from slrig.calibration.board import DEFAULT_BOARD
@@ -139,7 +139,7 @@ def turntable_client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterato
         worker=TameCompute(PIPELINE),
         manager=SimpleNamespace(rig=SimpleNamespace(axis=None)),
     )
-    monkeypatch.setattr(rig, "session_readings", lambda _: readings)
+    monkeypatch.setattr(calibration, "session_readings", lambda _: readings)
     monkeypatch.setattr(rig, "turntable_axis", found)
     monkeypatch.setattr(rig, "turntable_planes", lambda *_: find_turntable_planes(PLATE, AXIS))
     with TestClient(app_of(rig.turntable_router, service)) as made:

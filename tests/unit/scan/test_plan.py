@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from slrig.bundle import ScanDefaults
 from slrig.errors import ConfigError, PatternError, UnsupportedByDeviceError
 from slrig.model import (
     MIN_BASELINE_FRACTION,
@@ -22,6 +23,7 @@ from slrig.model import (
     FloatArray,
     Gray,
     LineShift,
+    MeshAxes,
     Pinhole,
     SequenceName,
     Sine,
@@ -227,6 +229,17 @@ def test_value_that_cannot_be_is_refused(
     for value in values:
         with pytest.raises(ConfigError, match=f"{key}.*: expected {words}"):
             plan(**{key: value})
+
+
+def test_axes_of_a_robot_need_its_place_and_come_back_with_it() -> None:
+    place = ((1.0, 0.0, 0.0, 5.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    plan = ScanPlan(reconstruction=ReconstructionPlan(mesh_axes=MeshAxes.ROBOT, rig_in_base=place))
+    assert plan_from_json(json.loads(json.dumps(plan_json(plan)))) == plan
+    with pytest.raises(ConfigError, match="robot needs to know where the rig is"):
+        ReconstructionPlan(mesh_axes=MeshAxes.ROBOT)
+    # It would be that of every scan, and a rig in hand is elsewhere in each.
+    with pytest.raises(ValueError, match="asked for scan by scan"):
+        ScanDefaults(mesh_axes=MeshAxes.ROBOT)
 
 
 def test_least_plan_is_accepted_and_names_are_taken_by_their_values() -> None:
