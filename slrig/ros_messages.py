@@ -190,20 +190,28 @@ class Messages:
             data=self.sequence(data),
         )
 
-    def transforms(self, devices: Mapping[str, Device]) -> Any:
-        """tf2_msgs/msg/TFMessage for /tf_static: where each device stands in the world."""
-        made = []
-        for name, device in devices.items():
-            place, turn = pose(device.rotation, device.translation_mm)
-            vector = self.class_of("geometry_msgs/msg/Vector3")(**dict(zip("xyz", place, strict=True)))
-            quaternion = self.class_of("geometry_msgs/msg/Quaternion")(**dict(zip("xyzw", turn, strict=True)))
-            moved = self.class_of("geometry_msgs/msg/Transform")(translation=vector, rotation=quaternion)
-            made.append(
-                self.class_of("geometry_msgs/msg/TransformStamped")(
-                    header=self._header(self.world), child_frame_id=name + FRAME, transform=moved
-                )
-            )
+    def transforms(self, devices: Mapping[str, Device], robot: tuple[str, Floats] | None = None) -> Any:
+        """tf2_msgs/msg/TFMessage for /tf_static: where each device stands in the world. robot : a frame of a robot, and
+        the pose of the world in it, (4, 4), mm.
+        """
+        made = [
+            self._transform(self.world, name + FRAME, device.rotation, device.translation_mm)
+            for name, device in devices.items()
+        ]
+        if robot is not None:
+            frame, placed = robot
+            back = placed[:3, :3].T
+            made.append(self._transform(frame, self.world, back, -back @ placed[:3, 3]))
         return self.class_of("tf2_msgs/msg/TFMessage")(transforms=made)
+
+    def _transform(self, parent: str, child: str, rotation: Floats, translation_mm: Floats) -> Any:
+        place, turn = pose(rotation, translation_mm)
+        vector = self.class_of("geometry_msgs/msg/Vector3")(**dict(zip("xyz", place, strict=True)))
+        quaternion = self.class_of("geometry_msgs/msg/Quaternion")(**dict(zip("xyzw", turn, strict=True)))
+        moved = self.class_of("geometry_msgs/msg/Transform")(translation=vector, rotation=quaternion)
+        return self.class_of("geometry_msgs/msg/TransformStamped")(
+            header=self._header(parent), child_frame_id=child, transform=moved
+        )
 
     def _header(self, frame: str) -> Any:
         seconds, nanoseconds = divmod(self.stamp_ns, _NS)

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.client import Captured, Client, Progress, ScanJob, ScanResult, StateChange
+from slrig.client.errors import ConflictError, NotFoundError
 from slrig.errors import ExtraMissingError, ScanCancelledError, SlrigError
 from slrig.ros_messages import PROJECTOR, TF_STATIC, WORLD, Device, Messages, topic
 
@@ -164,14 +165,15 @@ class ScanNode:
         return message
 
     def publish(self, result: ScanResult) -> None:
-        """Publish where the devices stand, how each sees, and the points of each camera, stamped with the time at which
-        the scan began. Raises ServiceError.
+        """Publish where the devices stand, on a robot too where that is known, how each sees, and the points of each
+        camera, stamped with the time at which the scan began. Raises ServiceError.
         """
-        devices = _devices(json.loads(self._client.scans.file(result.id, "calibration.json")))
+        calibration = json.loads(self._client.scans.file(result.id, "calibration.json"))
+        devices, robot = _devices(calibration), _robot(self._client, (calibration.get("solved") or {}).get("id"))
         seconds = datetime.fromisoformat(result.scan["started_at"]).timestamp()
         messages = Messages(class_of=_class_of, sequence=_sequence, seconds=seconds, world=self._world)
         with self._publishing:
-            self._send(TF_STATIC, messages.transforms(devices))
+            self._send(TF_STATIC, messages.transforms(devices, robot))
             for name, device in devices.items():
                 self._send(topic(name, "camera_info", under="~"), messages.camera_info(name, device))
                 if f"points-{name}.npz" in result.files:
@@ -219,6 +221,20 @@ def _devices(calibration: Mapping[str, Any]) -> dict[str, Device]:
         name: Device(*told["size_px"], *(np.array(told[each], dtype=np.float64) for each in names))
         for name, told in found.items()
     }
+
+
+def _robot(client: Client, calibration: str | None) -> tuple[str, NDArray[np.float64]] | None:
+    """The robot's frame in which the service knows its rig by hand-eye calibration, and the rig's pose in it, (4, 4),
+    mm; None where it does not. calibration : identifier of the scan's, in whose frame the points are, if it has one.
+    """
+    try:
+        found = client.hand_eye.get()
+    except (NotFoundError, ConflictError):
+        return None
+    if calibration not in (None, found["calibration"]):
+        return None
+    frame = found["flange_frame"] if found["kind"] == "in-hand" else found["base_frame"]
+    return frame, np.array(found["rig"], dtype=np.float64)
 
 
 def _class_of(kind: str) -> Any:

@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from slrig.extras.ros import device_of, encode_bag
 from slrig.model import Calibration, Pinhole, Size
@@ -95,6 +96,15 @@ def test_point_projects_where_transform_and_camera_info_say(turn: tuple[float, f
     np.testing.assert_allclose(found, expected[:, 0], rtol=0, atol=1e-8)
     _, (*_, w) = pose(device.rotation, device.translation_mm)
     assert w >= 0
+    # The same for the world in a robot's base.
+    base = np.eye(4)
+    base[:3, :3], base[:3, 3] = rotation, (1200.0, -300.0, 650.0)
+    placed = messages.transforms({}, ("base_link", base)).transforms[0]
+    assert (placed.header.frame_id, placed.child_frame_id) == ("base_link", "world")
+    turned, shift = placed.transform.rotation, placed.transform.translation
+    found_turn = Rotation.from_quat([turned.x, turned.y, turned.z, turned.w]).as_matrix()
+    np.testing.assert_allclose(found_turn, rotation, atol=1e-8)
+    np.testing.assert_allclose([shift.x, shift.y, shift.z], [1.2, -0.3, 0.65], atol=1e-12)
 
 
 @pytest.mark.parametrize(("seconds", "stamp_ns"), [(1.5, 1_500_000_000), (-1.0, 0), (2.0**31, 0)])
