@@ -204,6 +204,9 @@ def hand_eye(
     check: Annotated[
         Path | None, typer.Option(help="A hand_eye.json to hold the poses against, instead of solving: did it drift?")
     ] = None,
+    keep: Annotated[bool, typer.Option("--keep", help="Have a running service keep the result for its scans.")] = False,
+    *,
+    service: ServiceOptions,
     as_json: AsJson = False,
 ) -> None:
     """Find where the rig is on a robot, or in front of it.
@@ -219,7 +222,10 @@ def hand_eye(
         if not check_poses(given, identifier, check, as_json=as_json):
             raise typer.Exit(1)
         return
-    solve_poses(given, identifier, str(mounting), robot, Path(str(output)), as_json=as_json)
+    document = solve_poses(given, identifier, str(mounting), robot, Path(str(output)), as_json=as_json)
+    if keep:
+        with service.client() as client:
+            client.hand_eye.put(document)
 
 
 @app.command(name="list")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -77,16 +78,17 @@ def seen_by_rig(
 
 def solve_poses(
     given: SeenTargets, identifier: str | None, kind: str, robot: RobotOptions, output: Path, *, as_json: bool
-) -> None:
-    """Solve, write the file, and print what it says. Raises SolveRefusedError, StorageError."""
+) -> dict[str, Any]:
+    """Solve, write the file, print what it says, and return it. Raises SolveRefusedError, StorageError."""
     found = solve_hand_eye(given.robot, given.seen, HandEyeKind(kind), robot_sigma=robot.robot_sigma)
     document = hand_eye_document(
         found, identifier, base_frame=robot.base_frame, flange_frame=robot.flange_frame, refused=given.refused
     )
     write_hand_eye(output, document)
+    plain = document.model_dump(mode="json")
     if as_json:
-        print_json(document.model_dump(mode="json"))
-        return
+        print_json(plain)
+        return plain
     sigma = np.sqrt(np.diagonal(found.rig_covariance))
     place = ", ".join(f"{mm:.2f} ± {error:.2f}" for mm, error in zip(found.rig[:3, 3], sigma[3:], strict=True))
     noise = "estimated" if found.estimated else "stated"
@@ -108,6 +110,7 @@ def solve_poses(
             f"next      {escape(document.next_pose.words)}: {worst:.3f} mm become {document.next_pose.sigma_mm:.3f}"
         )
     console.print(f"written   {escape(str(output))}")
+    return plain
 
 
 def check_poses(given: SeenTargets, identifier: str | None, file: Path, *, as_json: bool) -> bool:

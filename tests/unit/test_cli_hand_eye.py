@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import httpx2
 import numpy as np
 import pytest
 import trimesh
@@ -19,11 +20,13 @@ from slrig.bundle import write_bundle, write_calibration
 from slrig.calibrate.hand_eye import hand_eye_document, read_hand_eye, write_hand_eye
 from slrig.calibration import PROJECTOR, BoardPose
 from slrig.calibration.hand_eye import HandEyeKind, solve_hand_eye
+from slrig.cli.options import ServiceOptions
 from slrig.model import Calibration, FloatArray
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply
 from slrig.scan.preparation import sample_scan
 from tests.unit.calibration.posed_boards import CHESSBOARD, Shooting, two_cameras_and_projector
 from tests.unit.calibration.robot_cells import RobotCell, cell, error_of, pose
+from tests.unit.client.service import client_of
 from tests.unit.command import done, refused, slrig
 from tests.unit.scan.test_mesh_formats import example_mesh
 
@@ -48,15 +51,26 @@ def files_of(made: RobotCell, folder: Path, stem: str) -> tuple[Path, Path]:
     return robot, write_csv(folder / f"{stem}-seen.csv", made.seen.names, made.seen.poses)
 
 
-def test_poses_of_a_body_become_a_file_that_new_poses_are_held_against(tmp_path: Path) -> None:
+def test_poses_of_a_body_become_a_file_that_new_poses_are_held_against(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept: list[tuple[str, str, bytes]] = []
+
+    def keep(asked: httpx2.Request) -> httpx2.Response:
+        kept.append((asked.method, asked.url.path, asked.read()))
+        return httpx2.Response(200, json={})
+
+    monkeypatch.setattr(ServiceOptions, "client", lambda _: client_of(keep))
     made, output = cell(HandEyeKind.IN_HAND, 4), tmp_path / "hand_eye.json"
     poses = made.robot.poses.copy()
     poses[2, :3, 3] += 3.0
     made = replace(made, robot=replace(made.robot, poses=poses))
-    told = hand_eye(*files_of(made, tmp_path, "first"), "--kind", "in-hand", "--output", output)
+    told = hand_eye(*files_of(made, tmp_path, "first"), "--kind", "in-hand", "--output", output, "--keep")
     for words in ("rig in the flange: ", "± 0.0", "left out  03: contradicts", "next      from pose", str(output)):
         assert words in told, words
     found = read_hand_eye(output)
+    ((method, path, body),) = kept
+    assert (method, path, json.loads(body)) == ("PUT", "/hand-eye", json.loads(output.read_bytes()))
     error = error_of(np.array(found.rig), made.rig)
     assert np.all(np.abs(error) < 4 * np.sqrt(np.diagonal(found.covariance)))
     np.testing.assert_allclose(np.array(found.inverse) @ found.rig, np.eye(4), atol=1e-9)
