@@ -303,11 +303,17 @@ def checked_poses(
 
 
 def _posed(observations: Sequence[PoseObservation], board: Board, calibration: Calibration) -> TargetPoses:
-    """The board's poses. Raises CalibrationError: the calibration is of other cameras."""
+    """The board's poses, with the error of its print's size, which scales all distances of the rig alike.
+
+    Raises CalibrationError: the calibration is of other cameras.
+    """
     from slrig.calibration.hand_eye import TargetPoses
     from slrig.calibration.health.drift import estimate_board_poses
 
-    return TargetPoses(*estimate_board_poses(observations, board, calibration))
+    seen = TargetPoses(*estimate_board_poses(observations, board, calibration))
+    sigma = 0.0 if calibration.solved is None else calibration.solved.scale_sigma
+    longer = sigma * np.hstack([np.zeros((len(seen.poses), 3)), seen.poses[:, :3, 3]]).ravel()
+    return replace(seen, covariance=seen.covariance + np.outer(longer, longer))
 
 
 def _of_robot(seen: TargetPoses, robot: Sequence[Any]) -> RobotPoses:

@@ -53,6 +53,7 @@ _KEPT = 0.75
 _ROUNDS = 4
 _RARE = 1e-3
 _NEXT_TURN_DEG = 30.0
+_SCALE_SIGMAS = 4.0
 
 
 class HandEyeKind(StrEnum):
@@ -174,23 +175,10 @@ class HandEye:
         change = _inverse_change(self.rig)
         return np.asarray(inverse), change @ self.rig_covariance @ change.T
 
-    def rig_in_base(self, flange: FloatArray | None) -> FloatArray:
-        """(4, 4): the rig in the robot's base, with the flange where it is; None will do for a fixed rig.
-
-        Raises CalibrationError if a rig in hand has no pose of the flange.
-        """
-        if self.kind is HandEyeKind.FIXED:
-            return self.rig
-        if flange is None:
-            message = "the rig is in the robot's hand: give the flange's pose with the scan, or take the rig's frame"
-            raise CalibrationError(message)
-        return np.asarray(flange @ self.rig)
-
 
 class Drift(NamedTuple):
     """New poses held against a calibration: the rig's move since then if nothing else moved, its deviation, and the
-    chance of residuals as large without any. shift : (3,) mm, turn : (3,) degrees, in the frame that `HandEye.rig` is
-    in. residual_mm, residual_deg : by pose.
+    chance of residuals as large without any. residual_mm, residual_deg : by pose.
     """
 
     shift_mm: float
@@ -217,7 +205,9 @@ class _Problem(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """squares : of all residuals, weighted; by_pose : of each, against what the others predict."""
+    """squares : of all residuals, weighted; by_pose : of each, against what the others predict. scale : by how much the
+    rig's distances are longer than the robot's moves, over themselves, and the deviation.
+    """
 
     rig: FloatArray
     target: FloatArray
@@ -227,6 +217,7 @@ class _Fit(NamedTuple):
     squares: float
     by_pose: FloatArray
     terms: int
+    scale: tuple[float, float]
 
     @property
     def freedom(self) -> int:
@@ -278,6 +269,12 @@ def solve_hand_eye(
     _require_turns(problem)
     _require_determined(_posterior(fit.rig, fit.target, problem, USUAL_NOISE), kind)
     covariance, remarks = _stated_covariance(fit, robot_sigma)
+    if abs(fit.scale[0]) > _SCALE_SIGMAS * fit.scale[1]:
+        longer, expected = 100 * fit.scale[0], 100 * fit.scale[1]
+        remarks += (
+            f"the rig measures {longer:+.3f} % longer than the robot moves, where {expected:.3f} % are expected: "
+            "was the board's print measured when the rig was calibrated?",
+        )
     found = HandEye(
         kind, fit.rig, fit.target, covariance, fit.noise, robot_sigma is None, problem.robot.names, *fit.sizes,
         left_out, remarks,
@@ -440,7 +437,11 @@ def _fit(problem: _Problem, stated: tuple[float, float] | None) -> _Fit:
     pulled, terms = left @ residual, problem.seen.terms
     rows = np.arange(len(residual)).reshape(-1, terms)
     by_pose = [pulled[own] @ np.linalg.pinv(left[np.ix_(own, own)], hermitian=True) @ pulled[own] for own in rows]
-    return _Fit(rig, target, covariance, noise, residual, float(residual @ pulled), np.array(by_pose), terms)
+    longer = np.zeros((len(rows), terms))
+    longer[:, -3:] = problem.seen.poses[:, :3, 3]
+    weight = longer.ravel() @ left @ longer.ravel()
+    scale = float(longer.ravel() @ pulled / weight), float(1 / np.sqrt(weight))
+    return _Fit(rig, target, covariance, noise, residual, float(residual @ pulled), np.array(by_pose), terms, scale)
 
 
 def _estimated_noise(
@@ -485,11 +486,16 @@ def _wrong_pose(fit: _Fit, *, estimated: bool) -> int | None:
 
 def _require_turns(problem: _Problem) -> None:
     """Refuse motions without turns about two axes."""
-    turns = Rotation.from_matrix(problem.robot.poses[:, :3, :3])
-    middle, in_hand = turns.mean(), problem.kind is HandEyeKind.IN_HAND
-    away = (middle.inv() * turns if in_hand else turns * middle.inv()).as_rotvec(degrees=True)
-    _, sizes, axes = np.linalg.svd(away / np.sqrt(len(away)))
+    in_hand = problem.kind is HandEyeKind.IN_HAND
+    _, sizes, axes = _turns(problem.robot.poses, own_axes=in_hand)
     frame, advice = problem.kind.frame, f"turn the flange by {_NEXT_TURN_DEG:g}° or more"
+    seen_deg = _turns(problem.seen.poses, own_axes=False)[1][0] if problem.seen.terms == 6 else 0.0
+    if seen_deg > 5 * max(sizes[0], _MIN_TURN_DEG):
+        message = (
+            f"the robot's poses turn by {sizes[0]:.2g}° (rms), and the board was seen to turn by {seen_deg:.2g}°: are "
+            "their angles in radians and read as degrees, or are they of other moments?"
+        )
+        raise SolveRefusedError(message)
     if sizes[0] < _MIN_TURN_DEG:
         message = (
             f"the robot moved without turning ({sizes[0]:.2g}° rms): the rig's place in the {frame} is undetermined "
@@ -504,6 +510,17 @@ def _require_turns(problem: _Problem) -> None:
             f"{_direction(across)}, and shoot again"
         )
         raise SolveRefusedError(message)
+
+
+def _turns(poses: FloatArray, *, own_axes: bool) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Singular vectors and values, degrees (rms), of the turns of poses from their mean, about the axes of what is
+    posed or of what it is posed in.
+    """
+    turns = Rotation.from_matrix(poses[:, :3, :3])
+    middle = turns.mean()
+    away = (middle.inv() * turns if own_axes else turns * middle.inv()).as_rotvec(degrees=True)
+    left, sizes, axes = np.linalg.svd(away / np.sqrt(len(away)))
+    return left, sizes, axes
 
 
 def _direction(vector: FloatArray) -> str:

@@ -69,6 +69,25 @@ def test_errors_that_all_poses_share_are_no_noise_of_theirs() -> None:
     assert along == pytest.approx(0.25, rel=0.2)
 
 
+def test_print_that_is_larger_than_stated_moves_nothing_beyond_the_stated_error() -> None:
+    ratios = []
+    for seed in range(8):
+        made = cell(HandEyeKind.FIXED, seed)
+        poses = made.seen.poses.copy()
+        poses[:, :3, 3] *= 1.01
+        longer = 0.007 * np.hstack([np.zeros((len(poses), 3)), poses[:, :3, 3]]).ravel()
+        known = [made.seen.covariance, made.seen.covariance + np.outer(longer, longer)]
+        found = [solve_hand_eye(made.robot, TargetPoses(made.seen.names, poses, each), made.kind) for each in known]
+        off = [error_of(each.rig, made.rig) / np.sqrt(np.diagonal(each.rig_covariance)) for each in found]
+        ratios.append(np.abs(off).max(axis=1))
+        (told,) = found[0].remarks
+        assert 0.8 < float(told.split("measures ")[1].split(" %")[0]) < 1.2
+        assert not found[1].remarks
+    plain, aware = np.max(ratios, axis=0)
+    assert plain > 4
+    assert aware < 3.5
+
+
 def turned(made: RobotCell, change: Callable[[Rotation], Rotation]) -> RobotPoses:
     poses = made.robot.poses.copy()
     poses[:, :3, :3] = change(Rotation.from_matrix(poses[:, :3, :3])).as_matrix()
@@ -100,6 +119,10 @@ WRONG: dict[str, tuple[Callable[[RobotCell], RobotPoses], str]] = {
         "each picture belongs to the pose listed after",
     ),
     "early": (lambda made: made.robot.select(np.roll(np.arange(12), -1)), "belongs to the pose listed before"),
+    "radians": (
+        lambda made: turned(made, lambda turn: Rotation.from_rotvec(np.radians(turn.as_rotvec()))),
+        "are their angles in radians",
+    ),
     "mixed up": (lambda made: made.robot.select(np.arange(12)[::-1].copy()), "in no other order or unit"),
 }
 
