@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 from uuid import UUID
 
 from fastapi import APIRouter, Body
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, model_validator
 
 from slrig.api.calibration import observed_boards
 from slrig.api.problems import problems
 from slrig.api.service import Service, Serving
-from slrig.bundle import FreeText, PoseEntry, Strict
-from slrig.calibrate.hand_eye import HandEyeDocument, HandEyeStore, checked_poses, solved_poses
+from slrig.bundle import CALIBRATION, FreeText, PoseEntry, Strict, read_calibration
+from slrig.calibrate.hand_eye import (
+    HandEyeDocument,
+    HandEyeStore,
+    ReadBoards,
+    ScannedSpheres,
+    checked_poses,
+    solved_poses,
+)
 from slrig.errors import CalibrationError, CalibrationStateError
+from slrig.jobs.data_folder import BUNDLE
+from slrig.jobs.records import JobKind
 from slrig.jobs.worker import REQUEST_WAIT_S, Task
 from slrig.model import Calibration
+from slrig.scan.artefacts import MESH
 
 _MOST_POSES = 200
 
@@ -27,19 +37,33 @@ router = APIRouter(prefix="/hand-eye", tags=["calibration"])
 
 
 class RobotPose(Strict):
-    """A pose of a session, and where the robot was."""
+    """What the rig saw, and where the robot was."""
 
-    pose: int = Field(description="its number in the session")
+    pose: int | None = Field(default=None, description="its number in the session")
+    scan: Annotated[UUID, Field(strict=False)] | None = Field(default=None, description="a scan of the sphere")
     robot_pose: PoseEntry = Field(description="of the flange in the robot's base, 4 x 4, mm")
 
 
 class PosesRequest(Strict):
-    """Poses of a session in which a robot moved the board, or the rig."""
+    """Poses of a session, or scans of a sphere, in which a robot moved these, or the rig."""
 
-    calibration: Annotated[UUID, Field(strict=False)] = Field(
-        description="the session; it need not be solved, and need not be the calibration in use"
+    calibration: Annotated[UUID, Field(strict=False)] | None = Field(
+        default=None, description="the session; it need not be solved, and need not be the calibration in use"
+    )
+    sphere_mm: Annotated[float, Field(gt=0, le=1000)] | None = Field(
+        default=None, description="diameter of the sphere, in place of a session"
     )
     poses: Annotated[list[RobotPose], Field(min_length=1, max_length=_MOST_POSES)]
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> Self:
+        wanted = "pose" if self.sphere_mm is None else "scan"
+        if (self.calibration is None) == (self.sphere_mm is None) or any(
+            getattr(each, wanted) is None or None not in (each.pose, each.scan) for each in self.poses
+        ):
+            message = "expected calibration and the number `pose` of each, or sphere_mm and the id `scan` of each"
+            raise ValueError(message)
+        return self
 
 
 class HandEyeRequest(PosesRequest):
@@ -78,6 +102,26 @@ def _store(service: Service) -> HandEyeStore:
     return HandEyeStore(service.folder.root)
 
 
+def _seen(service: Service, request: PosesRequest) -> ReadBoards | ScannedSpheres:
+    """What the rig saw. Raises CalibrationNotFoundError, JobNotFoundError, ConfigError, CalibrationStateError; and
+    CalibrationError: a scan is in the frame of another calibration than that in use.
+    """
+    if request.calibration is not None:
+        numbers = [int(each.pose or 0) for each in request.poses]
+        return ReadBoards(*observed_boards(service, request.calibration, numbers))
+    own, scans = _in_use(service), {}
+    for each in request.poses:
+        record = service.store.get(UUID(str(each.scan)), JobKind.SCAN)
+        folder = service.folder.scan(record.id)
+        service.folder.require_whole(folder, MESH)
+        of_scan = read_calibration(folder / BUNDLE / CALIBRATION).solve_id
+        if of_scan != own.solve_id:
+            message = f"scan {record.id} is of calibration {of_scan}, in use is {own.solve_id}: scan the sphere again"
+            raise CalibrationError(message)
+        scans[str(record.id)] = folder
+    return ScannedSpheres(scans, float(request.sphere_mm or 0.0), own)
+
+
 @router.get("", responses=problems(404, 409))
 def get_hand_eye(service: Serving) -> HandEyeDocument:
     """Return where the rig is, for the calibration in use."""
@@ -106,12 +150,10 @@ def delete_hand_eye(service: Serving) -> None:
 
 @router.post("", responses=problems(404, 409, 503, 507))
 def solve_hand_eye(service: Serving, request: Annotated[HandEyeRequest, Body()]) -> HandEyeDocument:
-    """Find where the rig is from poses of a session, by the calibration in use, and keep it."""
-    seen = observed_boards(service, request.calibration, [each.pose for each in request.poses])
+    """Find where the rig is from poses of a session or scans of a sphere, by the calibration in use, and keep it."""
     options = request.model_dump(include={"kind", "robot_sigma", "base_frame", "flange_frame"})
-    task = Task(
-        solved_poses, (*seen, [each.robot_pose for each in request.poses], options), what="hand-eye calibration"
-    )
+    given = _seen(service, request), [each.robot_pose for each in request.poses], options
+    task = Task(solved_poses, given, what="hand-eye calibration")
     document: HandEyeDocument = service.worker.run(task, within_s=REQUEST_WAIT_S)
     _store(service).put(document)
     return document
@@ -119,10 +161,10 @@ def solve_hand_eye(service: Serving, request: Annotated[HandEyeRequest, Body()])
 
 @router.post("/check", responses=problems(404, 409, 503))
 def check_hand_eye(service: Serving, request: Annotated[PosesRequest, Body()]) -> DriftBody:
-    """Hold new poses of the same board, at its place of then, against what is kept: did anything move?"""
-    seen = observed_boards(service, request.calibration, [each.pose for each in request.poses])
-    kept = _store(service).get(seen[2].solve_id)
-    task = Task(checked_poses, (*seen, [each.robot_pose for each in request.poses], kept), what="check of hand-eye")
+    """Hold new poses of the same target, at its place of then, against what is kept: did anything move?"""
+    kept = _store(service).get(_in_use(service).solve_id)
+    given = _seen(service, request), [each.robot_pose for each in request.poses], kept
+    task = Task(checked_poses, given, what="check of hand-eye")
     return DriftBody(**service.worker.run(task, within_s=REQUEST_WAIT_S))
 
 

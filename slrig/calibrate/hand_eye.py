@@ -266,39 +266,56 @@ class HandEyeStore:
         return self._folder / f"{hashlib.sha256(calibration.encode()).hexdigest()[:16]}.json"
 
 
+@dataclass(frozen=True, slots=True)
+class ReadBoards:
+    """Poses of a board that were read already."""
+
+    observations: Sequence[PoseObservation]
+    board: Board
+    calibration: Calibration
+
+    def targets(self, robot: Sequence[Any]) -> SeenTargets:
+        """The board's poses, in pairs with the robot's. Raises CalibrationError."""
+        seen = _posed(self.observations, self.board, self.calibration)
+        return SeenTargets(_named(seen.names, robot), seen, {})
+
+
+@dataclass(frozen=True, slots=True)
+class ScannedSpheres:
+    """Scans of a sphere, by their names: folders with a mesh.ply."""
+
+    scans: Mapping[str, Path]
+    diameter_mm: float
+    calibration: Calibration
+
+    def targets(self, robot: Sequence[Any]) -> SeenTargets:
+        """The sphere's centres, in pairs with the robot's poses. Raises PoseRefusedError."""
+        return seen_spheres(_named(tuple(self.scans), robot), self.scans, self.diameter_mm, lambda *_: None)
+
+
 # Short tasks of the worker
 
 
 def solved_poses(
-    observations: Sequence[PoseObservation],
-    board: Board,
-    calibration: Calibration,
-    robot: Sequence[Any],
-    options: Mapping[str, Any],
+    source: ReadBoards | ScannedSpheres, robot: Sequence[Any], options: Mapping[str, Any]
 ) -> HandEyeDocument:
-    """Solve by poses of a board and of a robot. options : of a request."""
+    """Solve by what the rig saw in poses of a robot. options : of a request."""
     from slrig.calibration.hand_eye import HandEyeKind, solve_hand_eye
 
-    seen = _posed(observations, board, calibration)
-    found = solve_hand_eye(
-        _of_robot(seen, robot), seen, HandEyeKind(options["kind"]), robot_sigma=options["robot_sigma"]
-    )
+    given, kind = source.targets(robot), HandEyeKind(options["kind"])
+    found = solve_hand_eye(given.robot, given.seen, kind, robot_sigma=options["robot_sigma"])
     frames = {key: options[key] for key in ("base_frame", "flange_frame")}
-    return hand_eye_document(found, calibration.solve_id, **frames)
+    return hand_eye_document(found, source.calibration.solve_id, **frames, refused=given.refused)
 
 
 def checked_poses(
-    observations: Sequence[PoseObservation],
-    board: Board,
-    calibration: Calibration,
-    robot: Sequence[Any],
-    document: HandEyeDocument,
+    source: ReadBoards | ScannedSpheres, robot: Sequence[Any], document: HandEyeDocument
 ) -> dict[str, Any]:
-    """What poses of a board and of a robot say of a hand-eye calibration."""
+    """What poses of a robot and what the rig saw in them say of a hand-eye calibration."""
     from slrig.calibration.hand_eye import check_hand_eye
 
-    seen = _posed(observations, board, calibration)
-    drift = check_hand_eye(hand_eye_of(document), _of_robot(seen, robot), seen)
+    given = source.targets(robot)
+    drift = check_hand_eye(hand_eye_of(document), given.robot, given.seen)
     return {**drift._asdict(), "holds": drift.holds, "residual_mm": drift.residual_mm.tolist()}
 
 
@@ -316,7 +333,7 @@ def _posed(observations: Sequence[PoseObservation], board: Board, calibration: C
     return replace(seen, covariance=seen.covariance + np.outer(longer, longer))
 
 
-def _of_robot(seen: TargetPoses, robot: Sequence[Any]) -> RobotPoses:
+def _named(names: tuple[str, ...], robot: Sequence[Any]) -> RobotPoses:
     from slrig.calibration.hand_eye import RobotPoses
 
-    return RobotPoses(seen.names, np.array(robot))
+    return RobotPoses(names, np.array(robot))

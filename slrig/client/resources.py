@@ -587,26 +587,32 @@ class HandEyeResource(Resource):
 
     def solve(
         self,
-        calibration: str,
         poses: Sequence[Mapping[str, Any]],
         *,
         kind: str,
+        calibration: str | None = None,
+        sphere_mm: float | None = None,
         robot_sigma: Sequence[float] | None = None,
         base_frame: str | None = None,
         flange_frame: str | None = None,
     ) -> Json:
-        """Find it from poses of a session: {"pose": its number, "robot_pose": the flange in the base, 4 x 4, mm} each.
+        """Find it: {"pose": a pose's number, "robot_pose": the flange in the base, 4 x 4, mm} each of a session, the
+        `calibration`; or, with `sphere_mm`, {"scan": a scan's id, "robot_pose": …} each.
 
         kind : "in-hand" or "fixed".
         """
-        options = given(robot_sigma=robot_sigma, base_frame=base_frame, flange_frame=flange_frame)
-        request = {"calibration": calibration, "poses": list(poses), "kind": kind, **options}
-        return self._connection.json("POST", "/hand-eye", json=request)
+        options = given(
+            calibration=calibration, sphere_mm=sphere_mm, robot_sigma=robot_sigma, base_frame=base_frame,
+            flange_frame=flange_frame,
+        )  # fmt: skip
+        return self._connection.json("POST", "/hand-eye", json={"poses": list(poses), "kind": kind, **options})
 
-    def check(self, calibration: str, poses: Sequence[Mapping[str, Any]]) -> Json:
+    def check(
+        self, poses: Sequence[Mapping[str, Any]], *, calibration: str | None = None, sphere_mm: float | None = None
+    ) -> Json:
         """Hold new poses, as for `solve`, against what is kept."""
-        request = {"calibration": calibration, "poses": list(poses)}
-        return self._connection.json("POST", "/hand-eye/check", json=request)
+        options = given(calibration=calibration, sphere_mm=sphere_mm)
+        return self._connection.json("POST", "/hand-eye/check", json={"poses": list(poses), **options})
 
 
 class TurntableResource(Resource):

@@ -25,10 +25,9 @@ from slrig.model import Calibration, FloatArray
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply
 from slrig.scan.preparation import sample_scan
 from tests.unit.calibration.posed_boards import CHESSBOARD, Shooting, two_cameras_and_projector
-from tests.unit.calibration.robot_cells import RobotCell, cell, error_of, pose
+from tests.unit.calibration.robot_cells import RobotCell, cell, error_of, pose, sphere_mesh
 from tests.unit.client.service import client_of
 from tests.unit.command import done, refused, slrig
-from tests.unit.scan.test_mesh_formats import example_mesh
 
 BOARD = ["--board", "chessboard", "--corners", "11x8", "--square-mm", "12"]
 
@@ -125,20 +124,10 @@ def test_boards_in_bundles_are_paired_with_poses(
 
 
 def test_spheres_in_scans_are_found(tmp_path: Path) -> None:
-    made, random = cell(HandEyeKind.IN_HAND, 7, sphere=True), np.random.default_rng(1)
-    ball = trimesh.creation.icosphere(subdivisions=4, radius=19.05)
-    for name, each in zip(made.robot.names, made.shown, strict=True):
-        facing = ball.vertices[:, 2] < -5
-        outwards = ball.vertices[facing] / 19.05
-        points = each[:3, 3] + outwards * (19.05 + random.normal(0, 0.01, (facing.sum(), 1)))
-        plain = example_mesh()
-        mesh = replace(
-            plain, vertices_mm=points.astype(np.float32), normals=outwards.astype(np.float32),
-            faces=np.zeros((1, 3), dtype=np.int32),
-            **{key: np.zeros_like(getattr(plain, key), shape=(len(points), *getattr(plain, key).shape[1:]))
-               for key in ("colour", "mark", "sigma_mm", "stripe")},
-        )  # fmt: skip
+    made = cell(HandEyeKind.IN_HAND, 7, sphere=True)
+    for number, (name, each) in enumerate(zip(made.robot.names, made.shown, strict=True)):
         (tmp_path / "scans" / name).mkdir(parents=True)
+        mesh = sphere_mesh(each[:3, 3], 38.1, number)
         (tmp_path / "scans" / name / "mesh.ply").write_bytes(encode_mesh_ply(mesh))
     robot = write_csv(tmp_path / "robot.csv", made.robot.names, made.robot.poses)
     hand_eye(robot, tmp_path / "scans", "--sphere", 38.1, "--kind", "in-hand", "--output", tmp_path / "found.json")

@@ -15,6 +15,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from slrig.api import calibration, hand_eye
+from slrig.bundle import write_calibration
 from slrig.calibrate.hand_eye import HandEyeDocument, hand_eye_document
 from slrig.calibrate.store import PoseRecord, SessionRecord
 from slrig.calibration import PROJECTOR, BoardPose
@@ -22,9 +23,10 @@ from slrig.calibration.hand_eye import HandEyeKind, solve_hand_eye
 from slrig.errors import CalibrationError, CalibrationNotFoundError
 from slrig.jobs.records import JobState
 from slrig.model import Calibration, FloatArray
+from slrig.scan.artefacts import encode_mesh_ply
 from tests.unit.api.conftest import ServedBench, app_of, ended
 from tests.unit.calibration.posed_boards import CHESSBOARD, Shooting, two_cameras_and_projector
-from tests.unit.calibration.robot_cells import cell, error_of, pose
+from tests.unit.calibration.robot_cells import cell, error_of, pose, sphere_mesh
 from tests.unit.jobs.tame_compute import TameCompute
 from tests.unit.scan.bench import PIPELINE
 
@@ -50,7 +52,13 @@ def service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     ]
     monkeypatch.setattr(calibration, "session_readings", lambda _: readings)
     return SimpleNamespace(
-        folder=SimpleNamespace(root=tmp_path, require_present=lambda: None),
+        folder=SimpleNamespace(
+            root=tmp_path,
+            require_present=lambda: None,
+            scan=lambda each: tmp_path / str(each),
+            require_whole=lambda *_: None,
+        ),
+        store=SimpleNamespace(get=lambda each, _: SimpleNamespace(id=each)),
         calibrations=SimpleNamespace(
             register=SimpleNamespace(get=lambda _: session), store=SimpleNamespace(folder=lambda _: tmp_path)
         ),
@@ -101,6 +109,29 @@ def test_hand_eye_is_solved_kept_checked_and_forgotten(client: TestClient, servi
     assert client.delete("/hand-eye").status_code == 204
     with pytest.raises(CalibrationNotFoundError):
         hand_eye.rig_in_base(service, flange.tolist(), needed=False)
+
+
+def test_scans_of_a_sphere_do_as_well(client: TestClient, service: Any, tmp_path: Path) -> None:
+    made = cell(HandEyeKind.FIXED, 7, sphere=True)
+    write_calibration(tmp_path / "rig.json", CALIBRATION)
+    poses = []
+    for number, (robot, shown) in enumerate(zip(made.robot.poses, made.shown, strict=True)):
+        folder = tmp_path / str(UUID(int=number))
+        (folder / "bundle").mkdir(parents=True)
+        (folder / "bundle" / "calibration.json").write_bytes((tmp_path / "rig.json").read_bytes())
+        (folder / "mesh.ply").write_bytes(encode_mesh_ply(sphere_mesh(shown[:3, 3], 38.1, number)))
+        poses.append({"scan": str(UUID(int=number)), "robot_pose": robot.tolist()})
+    found = client.post("/hand-eye", json={"sphere_mm": 38.1, "poses": poses, "kind": "fixed"})
+    assert found.status_code == 200, found.text
+    document = HandEyeDocument.model_validate_json(found.text)
+    error = error_of(np.array(document.rig), made.rig)
+    assert np.all(np.abs(error) < 4 * np.sqrt(np.diagonal(document.covariance)))
+    assert client.post("/hand-eye/check", json={"sphere_mm": 38.1, "poses": poses[:1]}).json()["holds"]
+    service.health = SimpleNamespace(health=lambda: (None, None, Calibration({"left": DEVICES["left"]}, None)))
+    other = client.post("/hand-eye", json={"sphere_mm": 38.1, "poses": poses, "kind": "fixed"})
+    assert "scan the sphere again" in other.json()["detail"]
+    mixed = client.post("/hand-eye/check", json=request(MADE.robot.poses[:1], sphere_mm=38.1))
+    assert "sphere_mm and the id `scan` of each" in mixed.text
 
 
 def test_what_does_not_fit_is_refused(client: TestClient) -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 
 from slrig.calibration.hand_eye import HandEyeKind, RobotPoses, TargetPoses
-from slrig.model import FloatArray
+from slrig.model import FloatArray, Mesh
 
 NOISE = (0.1, 0.02)
 """Of the robot: mm and degrees."""
@@ -91,3 +92,20 @@ def cell(
         kind, rig, target, RobotPoses(names, np.array(robot)), TargetPoses(names, np.array(seen), covariance),
         np.array(true),
     )  # fmt: skip
+
+
+def sphere_mesh(centre_mm: FloatArray, diameter_mm: float, seed: int) -> Mesh:
+    """What a scan has of a sphere: the side that faces the rig, with noise."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
+    outwards = ball.vertices[ball.vertices[:, 2] < -0.25]
+    count = len(outwards)
+    noise = np.random.default_rng(seed).normal(0, 0.01, (count, 1))
+    return Mesh(
+        vertices_mm=(centre_mm + outwards * (diameter_mm / 2 + noise)).astype(np.float32),
+        faces=np.zeros((1, 3), dtype=np.int32),
+        normals=outwards.astype(np.float32),
+        colour=np.zeros((count, 3), dtype=np.uint8),
+        mark=np.zeros(count, dtype=np.uint8),
+        sigma_mm=np.full(count, 0.01, dtype=np.float32),
+        stripe=np.zeros(count, dtype=np.int32),
+    )
