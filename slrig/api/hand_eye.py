@@ -27,11 +27,11 @@ from slrig.jobs.worker import REQUEST_WAIT_S, Task
 from slrig.model import Calibration
 from slrig.scan.artefacts import MESH
 
-_MOST_POSES = 200
+_MOST_POSES = 100
 
 PATHS = ("/hand-eye", "/hand-eye/check")
 MOST_BYTES = 2**18
-"""Of a request: 200 poses with all their digits."""
+"""Of a request: 100 poses with all their digits, and of a document."""
 
 router = APIRouter(prefix="/hand-eye", tags=["calibration"])
 

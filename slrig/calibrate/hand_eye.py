@@ -25,7 +25,7 @@ HAND_EYE = "hand_eye.json"
 _MAX_BYTES = 2**22
 _INDEPENDENT_POINTS = 100
 """Points of a sphere whose errors are taken to be independent: those of neighbours in a scan are alike."""
-_MAX_POSES = 1000
+_MAX_POSES = 300
 
 Covariance = Annotated[
     list[Annotated[list[float], Field(max_length=12)]],

@@ -240,8 +240,12 @@ def solve_hand_eye(
 
     robot_sigma : the robot's noise, mm and degrees; None estimates it.
 
-    Raises SolveRefusedError if the motions leave something undetermined, or no reading of the poses fits.
+    Raises SolveRefusedError if the motions leave something undetermined, or no reading of the poses fits;
+    CalibrationError: the noise is not above 0.
     """
+    if robot_sigma is not None and not all(each > 0 for each in robot_sigma):
+        message = f"the robot's noise: expected mm and degrees above 0, found {robot_sigma[0]:g} and {robot_sigma[1]:g}"
+        raise CalibrationError(message)
     if not len(robot.names) == len(seen.names) >= MIN_POSES:
         message = (
             f"expected {MIN_POSES} poses or more, each of robot and target, found {len(robot.names)} and "

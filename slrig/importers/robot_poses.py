@@ -21,7 +21,7 @@ from slrig.importers.documents import read_yaml
 from slrig.model import FloatArray
 
 _MAX_BYTES = 2**22
-_MAX_POSES = 1000
+_MAX_POSES = 300
 _UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 _ANGLES: Mapping[tuple[str, str, str], EulerOrder | None] = {
     ("a", "b", "c"): "ZYX",

@@ -249,6 +249,13 @@ def test_few_poses_are_refused_or_solved(count: int) -> None:
     assert np.all(np.abs(error_of(found.rig, made.rig)) < 4 * np.sqrt(np.diagonal(found.rig_covariance)))
 
 
+@pytest.mark.parametrize("noise", [(0.0, 0.02), (0.1, -1.0), (0.1, float("nan"))])
+def test_noise_that_is_none_is_refused(noise: tuple[float, float]) -> None:
+    made = cell(HandEyeKind.FIXED, 5)
+    with pytest.raises(CalibrationError, match="expected mm and degrees above 0"):
+        solve_hand_eye(made.robot, made.seen, made.kind, robot_sigma=noise)
+
+
 def test_pose_that_is_no_rigid_motion_is_refused() -> None:
     scaled: FloatArray = np.diag([1.02, 1.0, 1.0, 1.0])
     with pytest.raises(CalibrationError, match="robot pose '7': expected a rotation"):
