@@ -167,9 +167,10 @@ def _read_numbers(text: str) -> dict[str, Any] | FloatArray | None:
     return arrays[""] if list(arrays) == [""] else arrays or None
 
 
-def read_yaml(path: Path) -> Any:
-    """Return the data of a YAML file. Raises CalibrationError, with the line: the file is truncated, too large, nested
-    too deep, or has anchors, which can expand a short file without limit.
+def read_yaml(path: Path, *, several: bool = False) -> Any:
+    """Return the data of a YAML file; several : a list of its documents, as ROS prints messages. Raises
+    CalibrationError, with the line: the file is truncated, too large, nested too deep, or has anchors, which can expand
+    a short file without limit.
     """
     text = read_text(path, MAX_YAML_BYTES, CalibrationError)
     depth = 0
@@ -183,7 +184,10 @@ def read_yaml(path: Path) -> Any:
                     f"{path}: expected YAML without anchors, nested at most {MAX_YAML_DEPTH} deep, found otherwise"
                 )
                 raise CalibrationError(f"{message} at line {mark.line + 1}; export it again")
-        _require_single_keys(yaml.compose(text, _Loader), path)
+        for node in yaml.compose_all(text, _Loader) if several else (yaml.compose(text, _Loader),):
+            _require_single_keys(node, path)
+        if several:
+            return [each for each in yaml.load_all(text, _Loader) if each is not None]
         return yaml.load(text, _Loader)  # noqa: S506 - a safe loader
     except (yaml.YAMLError, ValueError) as cause:
         mark = getattr(cause, "problem_mark", None)

@@ -63,7 +63,8 @@ def read_robot_poses(path: Path, rotation: str | None = None) -> RobotPoses:
 
 def _rows(path: Path) -> list[Mapping[str, Any]]:
     if path.suffix.lower() in (".yml", ".yaml"):
-        found = read_yaml(path)
+        documents = read_yaml(path, several=True)
+        found = documents[0] if len(documents) == 1 else documents
     else:
         text = read_text(path, _MAX_BYTES, CalibrationError)
         if path.suffix.lower() == ".json":
@@ -79,7 +80,7 @@ def _rows(path: Path) -> list[Mapping[str, Any]]:
                 raise CalibrationError(message)
             found = [dict(zip(head, row, strict=True)) for row in rows[1:]]
     if isinstance(found, Mapping):
-        found = found.get("poses", found.get("views", found))
+        found = found.get("poses", found.get("views", [found]))
     if not isinstance(found, Sequence) or not all(isinstance(row, Mapping) for row in found):
         message = f"{path}: expected a list of poses, each with names for its numbers: {_FORMS}"
         raise CalibrationError(message)

@@ -162,7 +162,9 @@ PLACE_MM = (412.0, -35.5, 780.25)
 
 
 def written(path: Path, rows: list[Mapping[str, Any]]) -> Path:
-    if path.suffix == ".csv":
+    if path.name == "echoed.yaml":
+        path.write_text("".join(f"{json.dumps(row)}\n---\n" for row in rows))
+    elif path.suffix == ".csv":
         lines = [",".join(rows[0]), *(",".join(map(str, row.values())) for row in rows)]
         path.write_text("\n".join(lines))
     else:
@@ -192,6 +194,7 @@ def forms() -> dict[str, tuple[str, str | None, dict[str, Any]]]:
         "turning axes": ("poses.csv", "XYZ", place | staubli),
         "matrix": ("poses.json", None, {"matrix_mm": np.round(matrix, 4).tolist()}),
         "ROS": ("poses.yaml", None, {"header": {"frame_id": "base_link"}, "pose": message}),
+        "ros2 topic echo": ("echoed.yaml", None, {"header": {"frame_id": "base_link"}, "pose": message}),
         "ROS transform": (
             "poses.yaml", None, {"transform": {"translation": metres, "rotation": message["orientation"]}}
         ),
