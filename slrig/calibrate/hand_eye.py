@@ -6,10 +6,10 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field, model_validator
 
 from slrig.bundle import FreeText, PoseEntry, Strict, json_bytes, read_json_model, write_file
 from slrig.calibration import Board, PoseObservation, find_balls, fit_sphere
@@ -27,9 +27,21 @@ _INDEPENDENT_POINTS = 100
 """Points of a sphere whose errors are taken to be independent: those of neighbours in a scan are alike."""
 _MAX_POSES = 300
 
+
+def _check_covariance(rows: list[list[float]]) -> list[list[float]]:
+    square = all(len(row) == len(rows) for row in rows)
+    matrix = np.array(rows) if square else np.zeros((0, 0))
+    # Turns are small numbers beside shifts.
+    scale = np.sqrt(np.abs(np.diagonal(matrix))) + 1e-300
+    if not square or not (np.linalg.eigvalsh(matrix / np.outer(scale, scale)) > -1e-6).all():
+        raise ValueError("expected a covariance, square and without negative variances, found another matrix")
+    return rows
+
+
 Covariance = Annotated[
     list[Annotated[list[float], Field(max_length=12)]],
-    Field(max_length=12, description="of a small turn (x, y, z, rad) and the translation (mm)"),
+    Field(min_length=6, max_length=12, description="of a small turn (x, y, z, rad) and the translation (mm)"),
+    AfterValidator(_check_covariance),
 ]
 
 
@@ -66,13 +78,21 @@ class HandEyeDocument(Strict):
     joint_covariance: Covariance = Field(
         description="of rig and target together; of a sphere's centre, its place alone"
     )
-    robot_sigma_mm: float
-    robot_sigma_deg: float
+    robot_sigma_mm: Annotated[float, Field(gt=0)]
+    robot_sigma_deg: Annotated[float, Field(gt=0)]
     robot_sigma_estimated: bool = Field(description="from the residuals, and not stated")
-    poses: list[PoseResidual] = Field(max_length=_MAX_POSES)
+    poses: list[PoseResidual] = Field(min_length=4, max_length=_MAX_POSES)
     left_out: dict[str, str] = Field(description="by pose, why it does not count")
     remarks: list[str]
     next_pose: NextPose | None
+
+    @model_validator(mode="after")
+    def _of_one_target(self) -> Self:
+        sizes = len(self.covariance), len(self.inverse_covariance), len(self.joint_covariance)
+        if sizes not in ((6, 6, 12), (6, 6, 9)):
+            message = f"expected covariances of 6, 6 and 12 rows (9 by a sphere), found {sizes}"
+            raise ValueError(message)
+        return self
 
     def rig_in_base(self, robot_pose: Sequence[Sequence[float]] | None) -> FloatArray:
         """(4, 4): rig to base. robot_pose : of the flange in the base, which a rig in hand needs.

@@ -40,7 +40,9 @@ USUAL_NOISE = (0.1, 0.02)
 
 _STEPS, _SETTLED = 60, 1e-9
 _DETERMINED = 1e-9  # of the largest eigenvalue of the scaled information, along which steps are made
+_REGULAR = 1e-10
 _MAX_STEP_RAD = 0.5
+_MAX_REACH_MM = 1e5  # of a robot on rails, far less of others
 _MIN_TURN_DEG = 1.0
 """Least turn about a second axis, rms: less does not tell where the rig is along the first one."""
 _MAX_SIGMA_MM, _MAX_SIGMA_DEG = 5.0, 1.0
@@ -99,6 +101,12 @@ class RobotPoses:
                 message = (
                     f"robot pose '{name}': expected a rotation and a translation, rows of a matrix [R t; 0 0 0 1], "
                     f"found {np.round(pose, 4).tolist()}: check the order of its numbers"
+                )
+                raise CalibrationError(message)
+            if np.abs(pose[:3, 3]).max() > _MAX_REACH_MM:
+                message = (
+                    f"robot pose '{name}': expected a place within {_MAX_REACH_MM / 1000:g} m, found "
+                    f"{np.round(pose[:3, 3]).tolist()} mm: are its numbers in mm?"
                 )
                 raise CalibrationError(message)
 
@@ -287,9 +295,18 @@ def solve_hand_eye(
 
 
 def check_hand_eye(found: HandEye, robot: RobotPoses, seen: TargetPoses, /) -> Drift:
-    """Hold new poses of the same target, at its place of then, against a hand-eye calibration."""
+    """Hold new poses of the same target, at its place of then, against a hand-eye calibration.
+
+    Raises CalibrationError if it is another kind of target.
+    """
+    if len(found.covariance) != 6 + seen.terms:
+        kinds = ("a sphere", "a board") if seen.terms == 6 else ("a board", "a sphere")
+        message = (
+            f"the hand-eye calibration is by {kinds[0]}, and these poses are of {kinds[1]}: show it the same target"
+        )
+        raise CalibrationError(message)
     residual, slopes, by_robot = _linearise(found.rig, found.target, _Problem(robot, seen, found.kind))
-    own = seen.covariance + _robot_covariance(by_robot, found.robot_sigma)
+    own = _residual_covariance(seen, by_robot, found.robot_sigma)
     total = own + slopes @ found.covariance @ slopes.T
     weighted = np.linalg.solve(own, slopes[:, :6])
     # A sphere in one or two poses leaves some moves open: the least of those that explain it is told.
@@ -356,6 +373,15 @@ def _robot_covariance(by_robot: FloatArray, noise: tuple[float, float]) -> Float
     return np.asarray(block_diag(*(scaled @ np.swapaxes(scaled, 1, 2))))
 
 
+def _residual_covariance(seen: TargetPoses, by_robot: FloatArray, noise: tuple[float, float]) -> FloatArray:
+    return _regular(seen.covariance + _robot_covariance(by_robot, noise))
+
+
+def _regular(covariance: FloatArray) -> FloatArray:
+    """With a little more on its diagonal, so that it can be inverted wherever poses that do not fit lead a solve."""
+    return covariance + _REGULAR * np.diag(np.diagonal(covariance))
+
+
 def _applied(pose: FloatArray, step: FloatArray) -> FloatArray:
     moved = pose.copy()
     moved[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix() @ pose[:3, :3]
@@ -370,12 +396,13 @@ def _solved(
     squares = np.inf
     for _ in range(steps):
         residual, slopes, by_robot = _linearise(rig, target, problem)
-        weighted = cho_factor(problem.seen.covariance + _robot_covariance(by_robot, noise))
+        weighted = cho_factor(_residual_covariance(problem.seen, by_robot, noise))
         pull = slopes.T @ cho_solve(weighted, np.column_stack([slopes, residual]))
         squares = float(residual @ cho_solve(weighted, residual))
         sigma = 1 / np.sqrt(np.diagonal(pull) + 1e-300)
         step = sigma * np.linalg.lstsq(pull[:, :-1] * np.outer(sigma, sigma), sigma * pull[:, -1], rcond=_DETERMINED)[0]
-        step *= min(1.0, _MAX_STEP_RAD / max(np.abs(step[:3]).max(), 1e-12))
+        sizes = np.abs(step[:3]).max() / _MAX_STEP_RAD, np.abs(step[3:]).max() / _MAX_REACH_MM
+        step /= max(1.0, *sizes)
         rig = _applied(rig, step[:6])
         target = _applied(target, np.concatenate([np.zeros(6 - problem.seen.terms), step[6:]]))
         if np.abs(step / sigma).max() < _SETTLED:
@@ -386,7 +413,7 @@ def _solved(
 def _posterior(rig: FloatArray, target: FloatArray, problem: _Problem, noise: tuple[float, float]) -> FloatArray:
     """Covariance of rig and target; what is not determined has a very large one."""
     _, slopes, by_robot = _linearise(rig, target, problem)
-    weights = np.linalg.inv(problem.seen.covariance + _robot_covariance(by_robot, noise))
+    weights = np.linalg.inv(_residual_covariance(problem.seen, by_robot, noise))
     information = slopes.T @ weights @ slopes
     scale = 1 / np.sqrt(np.diagonal(information) + 1e-300)
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
@@ -434,7 +461,7 @@ def _fit(problem: _Problem, stated: tuple[float, float] | None) -> _Fit:
         if np.allclose(before, noise, rtol=0.01):
             break
     residual, slopes, by_robot = _linearise(rig, target, problem)
-    weights = np.linalg.inv(problem.seen.covariance + _robot_covariance(by_robot, noise))
+    weights = np.linalg.inv(_residual_covariance(problem.seen, by_robot, noise))
     covariance = _posterior(rig, target, problem, noise)
     # Each pose against the one that all others predict, by the inverse of the partitioned covariance.
     left = weights - weights @ slopes @ covariance @ slopes.T @ weights
@@ -458,7 +485,7 @@ def _estimated_noise(
 
     def cost(logarithms: FloatArray) -> float:
         mm, degrees = (np.exp(logarithms[told]) * USUAL_NOISE) ** 2
-        factor = cho_factor(problem.seen.covariance + mm * place + degrees * turn)
+        factor = cho_factor(_regular(problem.seen.covariance + mm * place + degrees * turn))
         weighted = cho_solve(factor, np.column_stack([slopes, residual]))
         information, pull = slopes.T @ weighted[:, :-1], slopes.T @ weighted[:, -1]
         left = residual @ weighted[:, -1] - pull @ np.linalg.lstsq(information, pull, rcond=1e-13)[0]
@@ -565,7 +592,9 @@ def _readings(problem: _Problem) -> Iterator[tuple[str, _Problem]]:
     )
     for unit, factor in (("m", 1000.0), ("cm", 10.0), ("inch", 25.4)):
         scaled = robot.poses * np.array([1.0, 1.0, 1.0, factor]) ** [[1], [1], [1], [0]]
-        yield f"the robot's positions are in {unit}, and not in mm", _Problem(replace(robot, poses=scaled), seen, kind)
+        if np.abs(scaled[:, :3, 3]).max() < _MAX_REACH_MM:
+            words = f"the robot's positions are in {unit}, and not in mm"
+            yield words, _Problem(replace(robot, poses=scaled), seen, kind)
     for order, roll in (("w, x, y, z", -1), ("x, y, z, w", 1)):
         quaternions = Rotation.from_quat(np.roll(turns.as_quat(), roll, axis=1))
         yield turned(f"the quaternions are in the order {order}, and not as stated", quaternions)

@@ -23,7 +23,7 @@ class MeshAxes(StrEnum):
     """Axes of the files that hold a mesh or its points, mm.
 
     UPRIGHT : x right, y up, z towards the rig, as viewers and CAD programs have them: (x, -y, -z) of the calibration.
-    RIG : those of the calibration, x right, y down, z away from the rig; for robots, and to compare with other data.
+    RIG : those of the calibration, x right, y down, z away from the rig, to compare with other data.
     ROBOT : those of the base of a robot, where hand-eye calibration says where the rig is in it.
     """
 

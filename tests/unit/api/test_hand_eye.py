@@ -147,6 +147,10 @@ def test_what_does_not_fit_is_refused(client: TestClient) -> None:
     other = hand_eye_document(solved, "another").model_dump(mode="json")
     refused = client.put("/hand-eye", json=other)
     assert refused.status_code == 422
+    broken = other | {"calibration": CALIBRATION.solve_id, "joint_covariance": [[-1.0] * 12] * 12}
+    assert "expected a covariance" in client.put("/hand-eye", json=broken).text
+    small = broken | {"joint_covariance": np.eye(7).tolist()}
+    assert "found (6, 6, 7)" in client.put("/hand-eye", json=small).text
     assert f"expected {CALIBRATION.solve_id}, which is in use, found another" in refused.json()["detail"]
 
 

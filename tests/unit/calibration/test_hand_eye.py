@@ -238,6 +238,13 @@ def test_drift_is_told_beyond_the_stated_error_alone(kind: HandEyeKind) -> None:
     assert abs(drift.turn_deg - 0.15) < 3 * drift.sigma_deg
 
 
+def test_board_is_not_held_against_a_sphere() -> None:
+    made, other = cell(HandEyeKind.FIXED, 1), cell(HandEyeKind.FIXED, 1, sphere=True)
+    found = solve_hand_eye(made.robot, made.seen, made.kind)
+    with pytest.raises(CalibrationError, match="is by a board, and these poses are of a sphere"):
+        check_hand_eye(found, other.robot, other.seen)
+
+
 @pytest.mark.parametrize("count", [3, 4])
 def test_few_poses_are_refused_or_solved(count: int) -> None:
     made = cell(HandEyeKind.FIXED, 5, count=count)
@@ -247,6 +254,18 @@ def test_few_poses_are_refused_or_solved(count: int) -> None:
         return
     found = solve_hand_eye(made.robot, made.seen, HandEyeKind.FIXED)
     assert np.all(np.abs(error_of(found.rig, made.rig)) < 4 * np.sqrt(np.diagonal(found.rig_covariance)))
+
+
+@parametrize_core("sphere", [False, True])
+def test_poses_of_nothing_end_in_a_refusal(sphere: bool) -> None:
+    random = np.random.default_rng(0)
+    for seed, reach_mm in enumerate((1.0, 1e3, 9e4)):
+        made = cell(HandEyeKind.FIXED, seed, count=6, sphere=sphere)
+        poses = [pose(random.uniform(-180, 180, 3), reach_mm * random.uniform(-1, 1, 3)) for _ in range(6)]
+        with pytest.raises(SolveRefusedError):
+            solve_hand_eye(RobotPoses(made.robot.names, np.array(poses)), made.seen, made.kind)
+    with pytest.raises(CalibrationError, match="within 100 m"):
+        RobotPoses(("1",), np.array([pose([0, 0, 9], [5e5, 0, 0])]))
 
 
 @pytest.mark.parametrize("noise", [(0.0, 0.02), (0.1, -1.0), (0.1, float("nan"))])
