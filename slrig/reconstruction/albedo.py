@@ -64,15 +64,15 @@ class AlbedoSamples:
     """Points and where their light was measured.
 
     points_mm : (n, 3) float64; normals : (n, 3), unit, NaN if unknown; camera : (n,) int32, camera of the point;
-    pixels_px : (n, 2) float64, (column, row) in it; shared : (n,) bool, True if another camera saw it, too; border :
-    (n,) bool, True at the border of the projector's image.
+    pixels_px : (n, 2) float64, (column, row) in it; seen_by : (n,) int64, one bit for each camera that measured it;
+    border : (n,) bool, True at the border of the projector's image.
     """
 
     points_mm: FloatArray
     normals: NDArray[np.floating[Any]]
     pixels_px: FloatArray
     camera: NDArray[np.int32]
-    shared: NDArray[np.bool_]
+    seen_by: NDArray[np.int64]
     border: NDArray[np.bool_]
 
 
@@ -177,15 +177,17 @@ def _incidence_kernel(
 def _camera_gains(
     points: AlbedoSamples, views: Sequence[Illumination], value: Light, incident: Light, reliable: NDArray[np.bool_]
 ) -> tuple[FloatArray, tuple[int, ...]]:
-    """`Albedo.gains` and `Albedo.shared`, each camera by those before it.
+    """`Albedo.gains` and `Albedo.shared`, each camera by those before it, from the one that most points are of.
 
     value : (n, C), before any gain; incident : (n, C) or (n, 1), light on each point; reliable : (n,).
     """
     gains = np.ones((len(views), value.shape[1]))
     shared = [0] * len(views)
-    for index, view in enumerate(views[1:], start=1):
-        before, own = reliable & (points.camera < index), reliable & (points.camera == index)
-        both = np.flatnonzero(before & points.shared)
+    order = np.argsort(-np.bincount(points.camera, minlength=len(views)), kind="stable").tolist()
+    for place, index in enumerate(order[1:], start=1):
+        view = views[index]
+        before, own = reliable & np.isin(points.camera, order[:place]), reliable & (points.camera == index)
+        both = np.flatnonzero(before & ((points.seen_by >> index & 1) == 1))
         both = both[:: len(both) // _MAX_SHARED + 1]
         pixels = project(view.device, points.points_mm[both])
         visible = _is_visible(view, pixels)
@@ -197,7 +199,10 @@ def _camera_gains(
         elif before.any() and own.any():
             known = value[before] * gains[points.camera[before]]
             gains[index] = np.median(known, axis=0) / np.median(value[own], axis=0)
-    return gains, tuple(shared)
+    # The first camera's is 1, and its points are those of the camera that the search began with.
+    shared[order[0]] = shared[0]
+    shared[0] = 0
+    return gains / gains[0], tuple(shared)
 
 
 def _is_visible(view: Illumination, pixels_px: FloatArray) -> NDArray[np.bool_]:

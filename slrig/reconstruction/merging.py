@@ -2,8 +2,10 @@
 
 A projector ray meets one surface point, so on a light sheet depth is a function of the projector row. Curves of one
 position from two cameras sample the same function, and are merged by row. Where both have it, the point is the mean
-weighted by inverse variance. Where only one has it, it fills the gap. The result is never two sheets. Cameras that
-contradict each other must not be merged: `redundancy` tells.
+weighted by inverse variance. Where only one has it, it fills the gap. The result is never two sheets. Further cameras
+are merged one after another. Fused points stand where the earlier camera has them, so the camera that samples the
+sheets most finely comes first: one of low resolution must not thin out what the others measure. Cameras that contradict
+each other must not be merged: `redundancy` tells.
 """
 
 from __future__ import annotations
@@ -26,13 +28,15 @@ _SAME_POINT_SIGMA = 12.0  # beyond this the cameras saw different surfaces, whic
 class MergedCurves:
     """Curves of all cameras, and the distances between them.
 
-    camera : (n,) int32, index of the camera whose pixel the point has. residual_sigma : (m,) float64, distance between
-    the points of two cameras on one ray over its standard deviation. residual_mm : (m,) float64, the same distance,
-    signed towards the first camera.
+    camera : (n,) int32, index of the camera whose pixel the point has. seen_by : (n,) int64, one bit for each camera
+    whose measurement is in the point. residual_sigma : (m,) float64, distance between the points of two cameras on one
+    ray over its standard deviation. residual_mm : (m,) float64, the same distance, signed towards the camera that was
+    merged first.
     """
 
     curves: SheetCurves
     camera: NDArray[np.int32]
+    seen_by: NDArray[np.int64]
     residual_sigma: FloatArray
     residual_mm: FloatArray
 
@@ -43,28 +47,38 @@ def merge_curves(parts: list[SheetCurves], centre_mm: FloatArray, /, *, widest_g
     centre_mm : (3,) float64, the projector's centre; widest_gap_px : rows between two consecutive points of one camera
     up to which the curve between them counts as measured.
     """
-    result, camera = parts[0], np.zeros(len(parts[0].points_mm), dtype=np.int32)
+    first, *others = sorted(range(len(parts)), key=lambda index: _spacing_px(parts[index]))
+    result, camera = parts[first], np.full(len(parts[first].points_mm), first, dtype=np.int32)
+    seen_by = np.int64(1) << camera.astype(np.int64)
     sigmas, distances = [], []
-    for index, part in enumerate(parts[1:], start=1):
-        result, camera, sigma, distance = _merge_pair(result, camera, part, index, centre_mm, widest_gap_px)
+    for index in others:
+        result, camera, seen_by, sigma, distance = _merge_pair(
+            result, camera, seen_by, parts[index], index, centre_mm, widest_gap_px
+        )
         sigmas.append(sigma)
         distances.append(distance)
     return MergedCurves(
-        result, camera, np.concatenate([np.zeros(0), *sigmas]), np.concatenate([np.zeros(0), *distances])
+        result, camera, seen_by, np.concatenate([np.zeros(0), *sigmas]), np.concatenate([np.zeros(0), *distances])
     )
+
+
+def _spacing_px(curves: SheetCurves) -> float:
+    """Usual distance of two points along a light sheet; infinite for a camera that measured none."""
+    return float(np.median(np.abs(np.diff(curves.along_px)))) if len(curves.along_px) > 1 else np.inf
 
 
 def _merge_pair(
     first: SheetCurves,
     camera: NDArray[np.int32],
+    seen_by: NDArray[np.int64],
     second: SheetCurves,
     index: int,
     centre_mm: FloatArray,
     widest_gap_px: float,
-) -> tuple[SheetCurves, NDArray[np.int32], FloatArray, FloatArray]:
+) -> tuple[SheetCurves, NDArray[np.int32], NDArray[np.int64], FloatArray, FloatArray]:
     first, order_first = sort_by_row(first)
     second, _ = sort_by_row(second)
-    camera = camera[order_first]
+    camera, own = camera[order_first], np.int64(1) << np.int64(index)
     offset = int(first.stripe.max(initial=-1)) + 1
     positions = np.union1d(first.position_px, second.position_px)
     a, b = _common_offsets(first, positions), _common_offsets(second, positions)
@@ -98,7 +112,9 @@ def _merge_pair(
     )
     cameras = np.concatenate([camera, np.full(int(unmatched.sum()), index, dtype=np.int32)])[order]
     has_partner = np.isfinite(sigma)
-    return result, cameras.astype(np.int32), sigma[has_partner], distance[has_partner]
+    is_fused = has_partner & (np.abs(sigma) <= _SAME_POINT_SIGMA)
+    seen_by = np.concatenate([seen_by[order_first] | np.where(is_fused, own, 0), np.full(int(unmatched.sum()), own)])
+    return result, cameras.astype(np.int32), seen_by[order], sigma[has_partner], distance[has_partner]
 
 
 def sort_by_row(curves: SheetCurves, /) -> tuple[SheetCurves, NDArray[np.intp]]:

@@ -251,12 +251,14 @@ def calibration_sigma(
     normals: NDArray[np.float32],
     source: NDArray[np.uint8],
     camera: NDArray[np.int32],
+    seen_by: NDArray[np.int64],
     tangents: FloatArray,
     /,
 ) -> FloatArray:
     """(n,) float64: standard deviation along the surface normal by the calibration, mm.
 
     points_mm : (n, 3); normals : (n, 3), unit; source : (n,) `Source`; camera : (n,), index of the camera of the point.
+    seen_by : (n,), one bit for each camera that measured it, for points of several.
     tangents : (n, 3), direction of the stripe in space, needed for points of two cameras only; without it the stripe is
     assumed perpendicular to the epipolar line. Without a normal, the standard deviation along the viewing ray is
     returned, practically an upper bound.
@@ -264,7 +266,7 @@ def calibration_sigma(
     sigma = np.zeros(len(points_mm))
     in_bands(
         _sigma_kernel, len(sigma), modes.devices, modes.sizes_px, modes.modes, modes.middle_mm, modes.row, modes.second,
-        points_mm, normals, source, camera, tangents, sigma,
+        points_mm, normals, source, camera, seen_by, tangents, sigma,
     )  # fmt: skip
     return sigma
 
@@ -349,7 +351,7 @@ def _sample_kernel(
 @kernel(in_every_scan=False)
 def _sigma_kernel(
     begin: int, end: int, devices: Any, sizes: Any, modes: Any, middle: Any, row: bool, second: int,
-    points: Any, normals: Any, source: Any, camera: Any, tangents: Any, sigma: Any,
+    points: Any, normals: Any, source: Any, camera: Any, seen_by: Any, tangents: Any, sigma: Any,
 ) -> None:  # fmt: skip
     last = len(devices) - 1
     parameters = _EACH * len(devices)
@@ -377,10 +379,17 @@ def _sigma_kernel(
             valid = add_sensitivity(devices, 0, second, a, b, 1.0, point, normal, g, line)
         else:
             a, b = 0.0 if row else 1.0, 1.0 if row else 0.0
+            measured = 0.0
             if source[i] == _ALL and camera_weights(devices, sizes, point, ray, g, weights) > 0:
                 for index in range(last):
+                    # A camera may have the point in its image, and something before it.
+                    weights[index] *= (seen_by[i] >> index) & 1
+                    measured += weights[index]
+            if measured > 0:
+                for index in range(last):
                     if weights[index] > 0:
-                        valid &= add_sensitivity(devices, index, last, a, b, weights[index], point, normal, g, line)
+                        share = weights[index] / measured
+                        valid &= add_sensitivity(devices, index, last, a, b, share, point, normal, g, line)
             else:
                 valid = add_sensitivity(devices, camera[i], last, a, b, 1.0, point, normal, g, line)
         x, y, z = point[0] - middle[0], point[1] - middle[1], point[2] - middle[2]

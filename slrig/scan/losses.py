@@ -401,7 +401,9 @@ def without_mirror_images(
         faces = images[mine[images].all(axis=1)]
         refusal = _with_phantom(seen.curves.refusal, points.pixels_px, faces, phantom & mine, mine & ~phantom)
         refused.append(replace(seen, curves=replace(seen.curves, refusal=refusal)))
-    rest = replace(joined, curves=select_points(points, ~phantom), camera=joined.camera[~phantom])
+    rest = replace(
+        joined, curves=select_points(points, ~phantom), camera=joined.camera[~phantom], seen_by=joined.seen_by[~phantom]
+    )
     return refused, rest, surface.among_points(~phantom)
 
 

@@ -294,9 +294,9 @@ def calibration_sigma_mm(
     modes = calibration_modes(calibration, [camera.name for camera in found.cameras], axis, second=found.second)
     if modes is None:
         return None
-    points = found.merged.curves
+    merged, points = found.merged, found.merged.curves
     tangents = stripe_tangents(points.points_mm, points.offsets, points.bridge_after)
-    return calibration_sigma(modes, points.points_mm, normals, points.source, found.merged.camera, tangents)
+    return calibration_sigma(modes, points.points_mm, normals, points.source, merged.camera, merged.seen_by, tangents)
 
 
 def _with_left_out(curves: CameraCurves, triangulated: SheetCurves, cause: NDArray[np.uint8]) -> NDArray[np.uint8]:

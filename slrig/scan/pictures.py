@@ -27,7 +27,6 @@ from slrig.model import (
     Pixels,
     Refusal,
     Size,
-    Source,
     linear_to_srgb,
 )
 from slrig.reconstruction import (
@@ -450,9 +449,7 @@ def coloured(
     """Colour each point by the camera that it counts as seen by. normals : (n, 3), unit, NaN where not known."""
     curves, nowhere = joined.curves, np.zeros(len(joined.camera), dtype=np.bool_)
     border = nowhere if projector is None else _at_border(curves, projector, axis)
-    points = AlbedoSamples(
-        curves.points_mm, normals, curves.pixels_px, joined.camera, curves.source == Source.ALL, border
-    )  # fmt: skip
+    points = AlbedoSamples(curves.points_mm, normals, curves.pixels_px, joined.camera, joined.seen_by, border)
     views = [
         Illumination(seen.device, seen.contrast, seen.clipped, seen.curves.refusal == Refusal.NONE) for seen in cameras
     ]

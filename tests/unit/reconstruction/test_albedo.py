@@ -71,14 +71,15 @@ def on_ball(device: Pinhole, pixels_px: FloatArray) -> FloatArray:
         return BALL.seen_along(device.centre_mm, opencv_rays(device, pixels_px))
 
 
-def points_in(*views: Illumination, shared: bool = True, count: int = 3000) -> AlbedoSamples:
-    """Random points that each camera sees, lit; those of the first are seen by all others as well."""
+def points_in(*views: Illumination, shared: bool = True, count: int = 3000, base: int = 0) -> AlbedoSamples:
+    """Random points that each camera sees, lit; those of the camera `base`, more than of any other, are seen by all."""
     random = np.random.default_rng(1)
     parts, pixels = [], []
-    for view in views:
+    for index, view in enumerate(views):
         rows, columns = np.nonzero(cv2.erode(view.decoded.astype(np.uint8), np.ones((5, 5), np.uint8)))
-        some = random.choice(len(rows), count)
-        places = np.stack([columns, rows], axis=1)[some] + random.uniform(-0.5, 0.5, (count, 2))
+        wanted = 2 * count if index == base else count
+        some = random.choice(len(rows), wanted)
+        places = np.stack([columns, rows], axis=1)[some] + random.uniform(-0.5, 0.5, (wanted, 2))
         points = on_ball(view.device, places)
         kept = lit(points) * np.linalg.norm(PROJECTOR.centre_mm - points, axis=1) ** 2 > 1.2 * MIN_COSINE
         parts.append(points[kept])
@@ -86,7 +87,9 @@ def points_in(*views: Illumination, shared: bool = True, count: int = 3000) -> A
     points, counts = np.concatenate(parts), [len(part) for part in parts]
     camera = np.repeat(np.arange(len(views), dtype=np.int32), counts)
     nowhere: NDArray[np.bool_] = np.zeros(len(points), dtype=np.bool_)
-    return AlbedoSamples(points, normals_of(points), np.concatenate(pixels), camera, (camera == 0) & shared, nowhere)
+    by_all = (camera == base) & shared
+    bits = np.where(by_all, (1 << len(views)) - 1, np.int64(1) << camera.astype(np.int64))
+    return AlbedoSamples(points, normals_of(points), np.concatenate(pixels), camera, bits, nowhere)
 
 
 def relative_error(found: Albedo, truth: FloatArray) -> float:
@@ -125,11 +128,12 @@ def test_places_between_pixels_are_those_of_opencv() -> None:
     assert np.array_equal(clipped, share.ravel() > 0)
 
 
+@pytest.mark.parametrize("base", [0, 1])
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_cameras_of_different_gain_come_to_one_scale_by_common_points(order: tuple[int, int]) -> None:
+def test_cameras_of_different_gain_come_to_one_scale_by_common_points(order: tuple[int, int], base: int) -> None:
     both = [seen_by(CAMERA), seen_by(OTHER_CAMERA, gain=3.7)]
     views = [both[index] for index in order]
-    points = points_in(*views)
+    points = points_in(*views, base=base)
     found = estimate_albedo(points, views, PROJECTOR.centre_mm)
     expected = 1 / 3.7 if order == (0, 1) else 3.7
     assert found.gains.ravel() == pytest.approx([1, expected], rel=2e-3)

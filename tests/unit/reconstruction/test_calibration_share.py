@@ -141,6 +141,7 @@ def share(
     axis: Axis = Axis.COLUMN,
     source: int = 0,
     camera: int = 0,
+    seen_by: int = 0b11,
     tangents: FloatArray | None = None,
 ) -> FloatArray:
     """The share in points that are all of one source and camera; tangents : NaN for none."""
@@ -149,7 +150,7 @@ def share(
     count = len(points)
     return calibration_sigma(
         modes, points, normals, np.full(count, source, dtype=np.uint8), np.full(count, camera, dtype=np.int32),
-        np.full((count, 3), np.nan) if tangents is None else tangents,
+        np.full(count, seen_by, dtype=np.int64), np.full((count, 3), np.nan) if tangents is None else tangents,
     )  # fmt: skip
 
 
@@ -233,8 +234,10 @@ def test_the_share_of_two_cameras_and_a_projector() -> None:
         rigid = moved(places, change)[2]
         for kind, field in enumerate(moved(points, change)):
             moves[kind].append(without_rigid(field, rigid, points, places))
-    for kind, (source, camera) in enumerate(((0, 0), (0, 1), (int(Source.ALL), 0))):
-        found = share(calibration, points, normals, cameras=NAMES, source=source, camera=camera)
+    both = int(Source.ALL)
+    # The last: the other camera has the point in its image, and did not measure it.
+    for kind, source, camera, seen_by in ((0, 0, 0, 1), (1, 0, 1, 2), (2, both, 0, 3), (1, both, 0, 2)):
+        found = share(calibration, points, normals, cameras=NAMES, source=source, camera=camera, seen_by=seen_by)
         assert np.abs(found / sigma_of(moves[kind], normals) - 1).max() < 0.01
 
 

@@ -130,6 +130,27 @@ def test_three_cameras_are_merged_one_after_the_other() -> None:
     assert all(len(cameras) == 1 for cameras in stripes.values())
 
 
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
+def test_the_finest_camera_is_merged_first_and_each_point_names_those_that_measured_it(
+    order: tuple[int, int, int],
+) -> None:
+    third = replace(CAMERA, translation_mm=CAMERA.translation_mm + np.array([15.0, 0.0, 0.0]))
+    coarse = np.arange(60.0, 140.0, 3.1)
+    every = [seen(CAMERA, coarse), seen(OTHER_CAMERA, ROWS), seen(third, np.arange(60.3, 120.0))]
+    result = merge_curves([every[index] for index in order], PROJECTOR.centre_mm, widest_gap_px=GAP_PX)
+    require_one_sheet(result.curves)
+    assert len(result.camera) == len(every[1].points_mm)
+    assert (result.camera == order.index(1)).all()
+    cameras = np.array([result.seen_by >> order.index(index) & 1 for index in range(3)])
+    along = result.curves.along_px
+    assert cameras[1].all()
+    assert cameras[0][along < 136].mean() > 0.98
+    assert cameras[2][along < 119].mean() > 0.98
+    assert not cameras[0][along > 141].any()
+    assert not cameras[2][along > 121].any()
+    assert ((cameras.sum(axis=0) > 1) == (result.curves.source == Source.ALL)).all()
+
+
 CENTRE = np.array([0.0, 0.0, -600.0])
 
 
