@@ -554,10 +554,10 @@ def _with_one_camera(
         added_mm = distance_mm
     against = {k for pair in pairs if best in pair and pairs[pair].is_contradicted for k in pair} - {best}
     left_out = [name for k, name in enumerate(scan.names) if k in against or k == odd]
+    used = [name for k, name in enumerate(scan.names) if scan.usable[k] and name not in left_out]
     note = (
         f"{_contradiction(found)}, {distance_mm:.3f} mm on the surface (68 % of it nearer), and no small move of one "
-        f"device explains it. The points of {_listed(left_out)} were left out, and those of camera "
-        f"'{scan.names[best]}' used: {why}"
+        f"device explains it. The points of {_listed(left_out)} were left out, and those of {_listed(used)} used: {why}"
     )
     if added_mm:
         note += ". The other may be right: the distance was added to the standard deviations, in squares"

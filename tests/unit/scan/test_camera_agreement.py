@@ -132,7 +132,7 @@ def test_of_three_cameras_the_odd_one_is_left_out() -> None:
     found = agreement(stripes, true)
     assert found.usable == (True, False, True)
     assert found.distance_mm == 0
-    assert "camera 'right' were left out" in found.notes[0]
+    assert "camera 'right' were left out, and those of camera 'left' and camera 'third' used" in found.notes[0]
 
 
 def test_an_area_that_two_cameras_see_differently_is_taken_from_one() -> None:
