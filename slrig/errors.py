@@ -7,6 +7,8 @@ are decided at the edges (`slrig.api.problems`, `slrig.cli`), never here.
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import ClassVar
 
 _FLAGS = {
@@ -40,10 +42,23 @@ class SlrigError(Exception):
     code: ClassVar[str] = "slrig"
     """Its name over HTTP and in records, independent of the class's name. A child without a code has its parent's."""
 
+    camera: str | None = None
+    """The camera that alone failed, as the rig calls it; None if that is not known, or if more than it failed."""
+
     def __init_subclass__(cls, *, code: str | None = None) -> None:
         super().__init_subclass__()
         if code is not None:
             cls.code = code
+
+
+@contextmanager
+def of_camera(name: str) -> Iterator[None]:
+    """Have errors of the block say which camera failed."""
+    try:
+        yield
+    except SlrigError as error:
+        error.camera = name
+        raise
 
 
 class InvalidInputError(SlrigError, code="invalid-input"):

@@ -153,6 +153,8 @@ class BundleWriter:
 
     def _commit(self) -> None:
         frames = [slot.frame for slot in self._slots if not slot.vacant]
+        # A camera that was lost has none that count.
+        there = self._cameras if self._ended is not None else {frame["camera"] for frame in frames}
         if not frames and self._ended is None:
             raise BundleError(f"{self.folder}: expected frames, found none; a bundle holds at least one frame")
         data: dict[str, Any] = {
@@ -162,6 +164,7 @@ class BundleWriter:
             "cameras": {
                 name: {"size_px": _extent(camera.size), "bit_depth": camera.bit_depth}
                 for name, camera in self._cameras.items()
+                if name in there
             },
             "patterns": [_pattern_document(pattern) for pattern in self._patterns],
             "frames": frames,

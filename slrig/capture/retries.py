@@ -9,7 +9,7 @@ from typing import Protocol
 
 from slrig.bundle import RefusedFrame
 from slrig.capture.frame_checks import CHECK_CABLE, Contradiction, describe_frame
-from slrig.errors import FrameTimeoutError, ScanEvidenceError
+from slrig.errors import FrameTimeoutError, ScanEvidenceError, of_camera
 from slrig.model import Black, Frame, PatternSequence, Shot, White
 
 MAX_FAILURES = 3
@@ -85,10 +85,12 @@ class RetryPolicy:
         self._attempts[camera, index] += 1
         self._exposures[camera] += 1
         if self._exposures[camera] > self.max_exposures:
-            raise ScanEvidenceError(
+            message = (
                 f"camera '{camera}': {self.max_exposures} exposures gave no {len(self._sequence)} frames that agree "
                 f"with one another; the last cause: {self._last_cause}"
             )
+            with of_camera(camera):
+                raise ScanEvidenceError(message)
 
     def holds(self, camera: str, index: int) -> bool:
         """True if a pattern that is shown again stays until its frame was checked. Where one was lost for the first
@@ -102,7 +104,8 @@ class RetryPolicy:
             self._t_first_ns = frame.t_start_ns
         time_s = (frame.t_start_ns - self._t_first_ns) / 1e9
         wanted = frame.camera in self._colour and isinstance(self._sequence.patterns[index], White | Black)
-        colour = frame.colour() if wanted and frame.colour is not None else None
+        with of_camera(frame.camera):
+            colour = frame.colour() if wanted and frame.colour is not None else None
         return Shot(index, frame.camera, frame.image, frame.exposure_s, time_s, colour)
 
     def submit(self, index: int, frame: Frame, fault: str | None) -> Shot | None:
@@ -134,7 +137,8 @@ class RetryPolicy:
         missing.append(cause)
         self._request_again(RefusedFrame(index, camera, self._attempts[camera, index], cause))
         if len(missing) >= MAX_FAILURES:
-            raise FrameTimeoutError(self._failure_message(camera, index, missing))
+            with of_camera(camera):
+                raise FrameTimeoutError(self._failure_message(camera, index, missing))
 
     def _resolve(self, shot: Shot, found: tuple[Contradiction, ...]) -> frozenset[int]:
         """Request the suspects again; return the patterns whose frames no longer count."""
@@ -178,7 +182,8 @@ class RetryPolicy:
         for index in patterns:
             causes = self._causes[camera, index]
             if len(causes) >= MAX_FAILURES:
-                raise ScanEvidenceError(self._failure_message(camera, index, causes))
+                with of_camera(camera):
+                    raise ScanEvidenceError(self._failure_message(camera, index, causes))
 
     def _failure_message(self, camera: str, index: int, causes: list[str]) -> str:
         return f"{describe_frame(camera, index, self._sequence.patterns[index])}: {describe_causes(causes)}"

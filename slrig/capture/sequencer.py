@@ -11,7 +11,7 @@ from slrig.capture.streaming import FrameReader, capture_streaming, earliest_cha
 from slrig.capture.triggering import CaptureSession, capture_by_software, capture_by_wire, differs_from_request
 from slrig.capture.verifier import Evidence
 from slrig.devices import AppliedSettings, Camera, CameraSettings, Rig, Trigger
-from slrig.errors import UnsupportedByDeviceError
+from slrig.errors import UnsupportedByDeviceError, of_camera
 from slrig.model import PatternSequence, Shot
 
 
@@ -103,7 +103,8 @@ def choose_triggers(rig: Rig) -> dict[str, Trigger]:
 
 def _configure_camera(camera: Camera, name: str, settings: CameraSettings) -> AppliedSettings:
     """Configure a camera, and compare the values read back."""
-    applied = camera.configure(settings)
+    with of_camera(name):
+        applied = camera.configure(settings)
     for setting, requested, actual, unit in (
         ("exposure", settings.exposure_s, applied.exposure_s, " s"),
         ("gain", settings.gain, applied.gain, ""),

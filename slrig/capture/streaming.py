@@ -26,7 +26,7 @@ from slrig.capture.latency import shutter_skew_s, stable_from_ns
 from slrig.capture.retries import RetryPolicy
 from slrig.capture.triggering import CaptureSession, with_camera_name
 from slrig.devices import Camera, Clock, DisplayedPattern, Rig, Trigger
-from slrig.errors import FrameTimeoutError
+from slrig.errors import FrameTimeoutError, of_camera
 from slrig.model import Frame, Shot
 
 MAX_UNPAIRED = 12
@@ -349,7 +349,8 @@ class _StreamingCapture:
             return
         name, came = arrival
         if isinstance(came, Exception):
-            raise came
+            with of_camera(name):
+                raise came
         if came is None:
             self._starting.remove(name)
             return

@@ -18,7 +18,7 @@ from slrig.capture.frame_checks import Contradiction, describe_frame, describe_p
 from slrig.capture.latency import shutter_skew_s, stable_from_ns
 from slrig.capture.retries import RetryPolicy, describe_causes
 from slrig.devices import AppliedSettings, DisplayedPattern, Rig, Trigger
-from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError, UnsupportedByDeviceError
+from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError, UnsupportedByDeviceError, of_camera
 from slrig.model import Frame, Gray, PatternSequence, Primary, Shot
 
 SETTINGS_TOLERANCE = 0.01
@@ -69,11 +69,19 @@ class CaptureSession:
 
     def read(self, name: str, after_ns: int, timeout_s: float) -> Frame:
         """Return the next frame with the camera's name in the rig. Raises as `Camera.read` does."""
-        frame = with_camera_name(name, self.rig.cameras[name].read(after_ns, timeout_s))
-        shift_ns = self.stamp_shift_ns(frame)
-        if shift_ns and self.triggers[name] is Trigger.FREE and frame.t_start_ns < after_ns + shift_ns + frame.t_err_ns:
-            frame = with_camera_name(name, self.rig.cameras[name].read(after_ns + shift_ns, timeout_s))
+        with of_camera(name):
+            frame = with_camera_name(name, self.rig.cameras[name].read(after_ns, timeout_s))
+            shift_ns = self.stamp_shift_ns(frame)
+            after_ns += shift_ns
+            if shift_ns and self.triggers[name] is Trigger.FREE and frame.t_start_ns < after_ns + frame.t_err_ns:
+                frame = with_camera_name(name, self.rig.cameras[name].read(after_ns, timeout_s))
         return frame
+
+    def arm(self, count: int) -> None:
+        """Arm every camera for as many frames. Raises as `Camera.arm` does."""
+        for name, camera in self.rig.cameras.items():
+            with of_camera(name):
+                camera.arm(count, self.triggers[name])
 
     def stamp_shift_ns(self, frame: Frame) -> int:
         """By how much the offset of a camera's time stamps may differ from that when the latency was measured, ns.
@@ -125,8 +133,7 @@ def capture_by_software(session: CaptureSession, retries: RetryPolicy) -> Iterat
     """Show each pattern, and again if frames fail, until every frame counts. Raises as `RetryPolicy` does."""
     rig = session.rig
     rig.projector.load(session.sequence)
-    for name, camera in rig.cameras.items():
-        camera.arm(retries.max_exposures, session.triggers[name])
+    session.arm(retries.max_exposures)
     ahead = iter(range(len(session.sequence)))
     last: dict[str, Frame] = {}
     waiting: list[_FrameResult] = []
@@ -150,7 +157,8 @@ def capture_by_software(session: CaptureSession, retries: RetryPolicy) -> Iterat
         for name in names:
             retries.start_exposure(name, index)
             if session.triggers[name] is Trigger.SOFTWARE:
-                rig.cameras[name].trigger()
+                with of_camera(name):
+                    rig.cameras[name].trigger()
         # The sensors are exposing: check the previous frames meanwhile.
         yield from _submit_frames(retries, waiting)
         waiting = [_read_frame(session, name, displayed, stable_ns, last) for name in names]
@@ -189,7 +197,8 @@ def _read_frame(
 class _Play:
     """One play of the sequence. levels : mean of each frame, by camera. delivered : pattern and camera of each frame
     that was yielded. withheld : frames after the first fault. doubts : frames that differ in light, none of which is
-    proven wrong. missing : number of faults that are missing frames.
+    proven wrong. missing : number of faults that are missing frames. culprits : cameras with a
+    fault.
     """
 
     levels: dict[str, list[float]]
@@ -201,6 +210,7 @@ class _Play:
     faults: list[str] = field(default_factory=list)
     doubts: list[Contradiction] = field(default_factory=list)
     missing: int = 0
+    culprits: set[str] = field(default_factory=set)
 
     def periods_apart(self, camera: str) -> int:
         """How many periods lie between a camera's exposures: 2 to 4 if it misses pulses, as one does whose read-out is
@@ -235,10 +245,10 @@ def capture_by_wire(session: CaptureSession, retries: RetryPolicy) -> Iterator[S
     last: dict[str, Frame] = {}
     causes: list[str] = []
     timed_out = 0
+    culprits: set[str] = set()
     for number in range(1, MAX_PLAYS + 1):
-        for camera in rig.cameras.values():
-            # Leave room for one frame too many, which would be a fault.
-            camera.arm(count + 1, Trigger.HARDWARE)
+        # Leave room for one frame too many, which would be a fault.
+        session.arm(count + 1)
         play = _Play({name: [] for name in rig.cameras}, lit_s, period_s)
         yield from _read_play(session, retries, play, last)
         rig.projector.stop()
@@ -254,6 +264,7 @@ def capture_by_wire(session: CaptureSession, retries: RetryPolicy) -> Iterator[S
             camera.disarm()
         causes.append(_describe_faults(play, session.sequence))
         timed_out += play.missing == len(play.faults)
+        culprits |= {*play.culprits, *(each.camera for each in play.doubts)}
         period_s *= max(map(play.periods_apart, rig.cameras))
         retries.evidence.clear()
         for index, name in play.delivered:
@@ -261,7 +272,9 @@ def capture_by_wire(session: CaptureSession, retries: RetryPolicy) -> Iterator[S
         for shot in play.withheld:
             retries.refuse(RefusedFrame(shot.pattern, shot.camera, number, causes[-1], shot))
     message = f"the sequence was played {MAX_PLAYS} times by wire: {describe_causes(causes)}"
-    raise FrameTimeoutError(message) if timed_out == len(causes) else ScanEvidenceError(message)
+    error = FrameTimeoutError(message) if timed_out == len(causes) else ScanEvidenceError(message)
+    error.camera = min(culprits) if len(culprits) == 1 else None
+    raise error
 
 
 def _require_exposing_pulses(session: CaptureSession, lit_s: float) -> None:
@@ -337,6 +350,7 @@ def _read_play(session: CaptureSession, retries: RetryPolicy, play: _Play, last:
             except FrameTimeoutError as error:
                 play.faults.append(_missing_frame_fault(session, play, name, index, error))
                 play.missing += 1
+                play.culprits.add(name)
                 active.remove(name)
                 continue
             play.levels[name].append(float(frame.image.mean()))
@@ -352,10 +366,13 @@ def _read_play(session: CaptureSession, retries: RetryPolicy, play: _Play, last:
                     # Report the first fault only, because lost frames shift all later ones.
                     play.faults.append(f"{where}: {fault}")
                 faulty.add(name)
+                play.culprits.add(name)
             elif not play.faults:
                 # After the first fault, frames are only recorded.
                 found = retries.evidence.add_shot(shot)
-                play.faults += [str(each) for each in found if not each.is_doubt]
+                proven = [each for each in found if not each.is_doubt]
+                play.faults += map(str, proven)
+                play.culprits |= {each.camera for each in proven}
                 play.doubts += [each for each in found if each.is_doubt]
             if play.faults:
                 play.withheld.append(shot)
@@ -367,6 +384,7 @@ def _read_play(session: CaptureSession, retries: RetryPolicy, play: _Play, last:
         with suppress(FrameTimeoutError):
             extra = session.read(name, last[name].t_end_ns, 1.5 * period_s)
             play.levels[name].append(float(extra.image.mean()))
+            play.culprits.add(name)
             play.faults.append(
                 f"camera '{name}' gave more than the {count} frames of the sequence: something else triggers it; check "
                 "the trigger cable and its polarity, and shield it from the projector's other outputs"

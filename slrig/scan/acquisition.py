@@ -48,7 +48,14 @@ from slrig.capture import (
 from slrig.capture.sequencer import capture, choose_triggers
 from slrig.capture.triggering import differs_from_request
 from slrig.devices import Camera, CameraSettings, Rig, Trigger, Turntable
-from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError
+from slrig.errors import (
+    DeviceError,
+    FrameTimeoutError,
+    ScanCancelledError,
+    ScanEvidenceError,
+    UnsupportedByDeviceError,
+    of_camera,
+)
 from slrig.failure import disk_errors
 from slrig.jobs.job import FrameSink
 from slrig.jobs.listener import SILENT, Listener
@@ -82,6 +89,8 @@ class Exposing:
         Is given every exposure that does not count.
     colour
         Cameras whose white and black frames are kept in colour, too.
+    may_lose
+        Whether to go on without a camera that fails or sees nothing, if the others can measure.
     """
 
     def __init__(
@@ -93,7 +102,11 @@ class Exposing:
         recorder: Recorder,
         *,
         colour: Collection[str] = (),
+        may_lose: bool = False,
     ) -> None:
+        self.lost: dict[str, str] = {}
+        """Cameras that the scan goes on without, each with the cause."""
+        self._may_lose = may_lose
         self._rig = rig
         self._sequence = sequence
         self._exposures_s: tuple[float | None, ...] = tuple(exposures_s) or (None,)
@@ -110,6 +123,7 @@ class Exposing:
         self._done: set[tuple[float | None, int, str]] = set()
         self._begun_s: float | None = None
         self._causes: dict[str, str] = {}
+        self._verdicts: dict[str, ExposureVerdict] = {}
 
     @property
     def _bracket(self) -> bool:
@@ -139,13 +153,63 @@ class Exposing:
             Also: no exposure of a bracket is of use to a camera, or something moved between two of them.
         """
         since_ns = self._rig.clock.now_ns() if self._bracket else None
-        cameras = list(self._rig.cameras)
+        while True:
+            try:
+                yield from self._all_exposed(since_ns)
+            except (DeviceError, ScanEvidenceError) as error:
+                if not self._goes_on_after(error):
+                    if not self.lost:
+                        raise
+                    words = "; ".join(lost_words(self.lost))
+                    message = f"{error}. Before that, {words}"
+                    raise type(error)(message) from error
+            else:
+                return
+
+    def _all_exposed(self, since_ns: int | None) -> Iterator[Shot]:
+        cameras = list(self._formats)
         for exposure_s in self._exposures_s:
             yield from self._exposed(exposure_s, cameras, since_ns)
         unseen = [name for name in self._formats if name not in self._compared]
         if self._bracket and unseen:
             message = f"no exposure of the bracket is of use to camera '{unseen[0]}': {self._causes[unseen[0]]}"
-            raise ScanEvidenceError(message)
+            with of_camera(unseen[0]):
+                raise ScanEvidenceError(message)
+
+    def _goes_on_after(self, error: DeviceError | ScanEvidenceError) -> bool:
+        """Whether the sequence can begin again without the camera that failed. If so, what there is of it is taken
+        back, and of the others, which are shot again.
+
+        A camera that cannot do what the rig file asks is no lost one; nor is one whose frames are wrong: whatever that
+        is, it may be wrong for all.
+        """
+        name = error.camera
+        others = [each for each in self._formats if each != name]
+        if not self._may_lose or name is None or not _measure(self._rig, others):
+            return False
+        if isinstance(error, UnsupportedByDeviceError):
+            return False
+        if isinstance(error, ScanEvidenceError) and not self._sees_nothing(name):
+            return False
+        self.lost[name] = str(error)
+        (words,) = lost_words({name: str(error)})
+        _log.warning(words, rig=self._rig.name)
+        for run in reversed(self._runs):
+            for pattern, camera in sorted(run.standing):
+                cause = words if camera == name else f"the sequence was begun again without camera '{name}'"
+                attempt = run.refused[pattern, camera] + 1
+                self._note(RefusedFrame(pattern, camera, attempt, cause, delivered=True))
+        self._runs.clear()
+        self._compared.clear()
+        del self._formats[name]
+        self._done = {each for each in self._done if each[2] != name}
+        return True
+
+    def _sees_nothing(self, name: str) -> bool:
+        found = self._judged(self._runs[-1], name)
+        if found is None and name not in self._compared:
+            found = self._verdicts.get(name)
+        return found is not None and found.fault is ExposureFault.TOO_DARK
 
     def summary(self) -> EvidenceSummary:
         """Sum up what the frames have proven, once all are there."""
@@ -162,23 +226,25 @@ class Exposing:
         self._skip(exposure_s, set(self._formats) - set(cameras))
         while taking:
             formats = {name: self._formats[name] for name in taking}
+            # The summary of a bracket has what was refused by itself.
+            earlier = () if self._bracket else tuple(self._refused)
             run = _BracketRun(
-                exposure_s, Evidence(self._sequence.patterns, formats, projector=self._sequence.projector)
+                exposure_s, Evidence(self._sequence.patterns, formats, earlier, projector=self._sequence.projector)
             )
+            self._runs.append(run)
             try:
                 yield from self._run(run, taking, since_ns)
             except ScanEvidenceError as error:
                 unfit = self._unfit(run, taking)
                 if not unfit:
                     raise self._placed(error, run) from error
-                self._leave_out(run, unfit)
+                self._leave_out(self._runs.pop(), unfit)
                 taking = [name for name in taking if name not in unfit]
                 cameras[:] = [n for n in cameras if n not in unfit or unfit[n].fault is not ExposureFault.TOO_BRIGHT]
                 continue
             self._compare(run, taking)
             # Whole images: nobody asks for them again.
             run.ends.clear()
-            self._runs.append(run)
             return
 
     def _run(self, run: _BracketRun, taking: Sequence[str], since_ns: int | None) -> Iterator[Shot]:
@@ -200,15 +266,12 @@ class Exposing:
 
     def _set_to(self, exposure_s: float | None, taking: Sequence[str]) -> Rig:
         rig = self._rig
-        if exposure_s is None:
-            return rig
-        # A rig file without a gain means 1.
-        known = {name: rig.settings.get(name, CameraSettings(exposure_s)) for name in taking}
-        return replace(
-            rig,
-            cameras={name: rig.cameras[name] for name in taking},
-            settings={name: replace(each, exposure_s=exposure_s) for name, each in known.items()},
-        )
+        known = {name: each for name, each in rig.settings.items() if name in taking}
+        if exposure_s is not None:
+            # A rig file without a gain means 1.
+            whole = {name: known.get(name, CameraSettings(exposure_s)) for name in taking}
+            known = {name: replace(each, exposure_s=exposure_s) for name, each in whole.items()}
+        return replace(rig, cameras={name: rig.cameras[name] for name in taking}, settings=known)
 
     def _timed(self, shot: Shot) -> Shot:
         """The frame with its time counted from the first frame of all."""
@@ -219,17 +282,19 @@ class Exposing:
         return replace(shot, time_s=round(shot.time_s - self._begun_s, 9))
 
     def _see(self, run: _BracketRun, shot: Shot) -> None:
+        patterns = self._sequence.patterns
+        pattern = patterns[shot.pattern]
+        if isinstance(pattern, White | Black) and shot.pattern == patterns.index(pattern):
+            run.ends[shot.pattern, shot.camera] = shot.image
         if self._bracket:
-            if isinstance(self._sequence.patterns[shot.pattern], White | Black):
-                run.ends[shot.pattern, shot.camera] = shot.image
             samples = self._samplers[shot.camera].take(shot.image)
             run.samples.setdefault(shot.camera, {})[shot.pattern] = samples
 
     def _take_refusal(self, run: _BracketRun, refused: RefusedFrame) -> None:
+        shot = None if refused.shot is None else self._timed(refused.shot)
+        if shot is not None:
+            self._see(run, shot)
         if self._bracket:
-            shot = None if refused.shot is None else self._timed(refused.shot)
-            if shot is not None:
-                self._see(run, shot)
             refused = replace(refused, shot=shot, cause=f"at {run.exposure_s:g} s, {refused.cause}")
         run.standing.discard((refused.pattern, refused.camera))
         run.refused[refused.pattern, refused.camera] += 1
@@ -245,18 +310,18 @@ class Exposing:
             return {}
         found: dict[str, ExposureVerdict] = {}
         for name in taking:
-            white, black = (self._end(run, name, kind) for kind in (White(), Black()))
-            if white is None or black is None:
-                continue
-            told = judge_exposure(white, black, self._formats[name])
+            told = self._judged(run, name)
             # Light that a shorter exposure has seen cannot be too little for a longer one: then it went off.
             if told is not None and (told.fault is ExposureFault.TOO_BRIGHT or name not in self._compared):
                 found[name] = told
         return found
 
-    def _end(self, run: _BracketRun, name: str, kind: White | Black) -> Pixels | None:
-        index = self._sequence.patterns.index(kind) if kind in self._sequence.patterns else -1
-        return run.ends.get((index, name))
+    def _judged(self, run: _BracketRun, name: str) -> ExposureVerdict | None:
+        patterns = self._sequence.patterns
+        white, black = (
+            run.ends.get((patterns.index(kind) if kind in patterns else -1, name)) for kind in (White(), Black())
+        )
+        return None if white is None or black is None else judge_exposure(white, black, self._formats[name])
 
     def _leave_out(self, run: _BracketRun, unfit: dict[str, ExposureVerdict]) -> None:
         """Take back what there is of a sequence, and say why."""
@@ -264,7 +329,7 @@ class Exposing:
         for name, told in unfit.items():
             longer = "; it was not exposed longer than that" if told.fault is ExposureFault.TOO_BRIGHT else ""
             cause = f"{run.exposure_s:g} s is {told.fault} for camera '{name}': {told.description}{longer}"
-            self._causes[name] = cause
+            self._causes[name], self._verdicts[name] = cause, told
             white = self._sequence.patterns.index(White())
             self._note(RefusedFrame(white, name, run.refused[white, name] + 1, cause, left_out=True))
         for pattern, name in sorted(run.standing):
@@ -292,7 +357,24 @@ class Exposing:
             self._compared[name] = exposed
 
     def _placed(self, error: ScanEvidenceError, run: _BracketRun) -> ScanEvidenceError:
-        return ScanEvidenceError(f"at an exposure of {run.exposure_s:g} s, {error}") if self._bracket else error
+        if not self._bracket:
+            return error
+        placed = ScanEvidenceError(f"at an exposure of {run.exposure_s:g} s, {error}")
+        placed.camera = error.camera
+        return placed
+
+
+def _measure(rig: Rig, names: Collection[str]) -> bool:
+    """Whether these cameras of a rig have two rays for each point."""
+    if rig.calibration is None:
+        return len(names) > 0
+    known = [name for name in names if name in rig.calibration.cameras]
+    return len(known) > (0 if rig.calibration.projector is not None else 1)
+
+
+def lost_words(lost: Mapping[str, str]) -> list[str]:
+    """A sentence on each camera that a scan goes on without, by its cause."""
+    return [f"camera '{name}' was lost, and the scan went on without it: {cause}" for name, cause in lost.items()]
 
 
 MOST_WAITING_BYTES = 256 * 2**20
@@ -417,6 +499,7 @@ def capture_frames(
     *,
     frames: FrameSink | None = None,
     health: Mapping[str, Any] | None = None,
+    may_lose: bool = False,
 ) -> Recording:
     """Play the plan's patterns on the rig, and return when the last frame is proven. What comes back brings the bundle
     to `folder`, which must not exist.
@@ -424,7 +507,8 @@ def capture_frames(
     Where the plan says at which angle of the rig's turntable, that turns there first.
 
     `frames` is shown each frame that has passed its test, and once more the frames that took another one's place.
-    health : of the rig's calibration, for the bundle.
+    health : of the rig's calibration, for the bundle. may_lose : whether to go on without a camera that fails or
+    sees nothing, as long as the others measure; the bundle's notes then say so.
 
     Raises
     ------
@@ -455,7 +539,7 @@ def capture_frames(
     with ExitStack() as writing:
         writing.enter_context(writer)
         recorder = writing.enter_context(Recorder(writer))
-        exposing = Exposing(rig, sequence, exposures_s, listener, recorder, colour=colour)
+        exposing = Exposing(rig, sequence, exposures_s, listener, recorder, colour=colour, may_lose=may_lose)
         if frames is not None:
             once = tuple((index, name) for index in range(len(sequence)) for name in formats)
             listed = once * max(len(exposures_s), 1)
@@ -478,7 +562,8 @@ def capture_frames(
             raise type(error)(message) from error
         if frames is not None:
             frames.end(exposing.summary())
-        return Recording(folder, writing.pop_all(), told, rig.truth(), turntable, health)
+        notes = [*lost_words(exposing.lost), *told]
+        return Recording(folder, writing.pop_all(), notes, rig.truth(), turntable, health)
 
 
 def _turned(rig: Rig, plan: ScanPlan, listener: Listener) -> TurntableAngle | None:

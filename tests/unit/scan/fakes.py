@@ -239,6 +239,7 @@ class TameBench:
         *,
         frames: FrameSink | None = None,
         health: Mapping[str, Any] | None = None,
+        may_lose: bool = False,  # noqa: ARG002 - of the contract
     ) -> Recording:
         rig.projector.show(0)
         self.captured.append((rig, plan, health))
