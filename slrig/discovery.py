@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
@@ -44,6 +44,7 @@ from slrig.devices import (
     require_projector_info,
 )
 from slrig.errors import (
+    CalibrationError,
     ConfigError,
     DeviceError,
     DriverBrokenError,
@@ -206,8 +207,11 @@ class DeviceSearch:
         return self._found
 
 
-def open_rig(config: RigConfig) -> Rig:
+def open_rig(config: RigConfig, *, may_lose: bool = False) -> Rig:
     """Open every device of a rig. If one fails, those that are open are closed again.
+
+    may_lose : whether to do without cameras that cannot be opened, as long as the others and the projector can measure;
+    `Rig.lost` says why. A fault of the rig file is raised all the same.
 
     Faults of the rig file are reported for all devices together. The calibration is that of the rig file or, without
     one, that of the head.
@@ -216,8 +220,9 @@ def open_rig(config: RigConfig) -> Rig:
     (several faults, unknown drivers among them, are one message); CalibrationError: the calibration is malformed, or
     made for devices of another size; DeviceError: a device cannot be opened.
     """
+    lost: dict[str, SlrigError] | None = {} if may_lose else None
     with ExitStack() as opened:
-        head, projector, cameras, positioner = _open_each(config, opened)
+        head, projector, cameras, positioner = _open_each(config, opened, lost)
         if config.head is not None:
             table_settings = dict.fromkeys(cameras, (config.head.exposure_s, config.head.gain))
         else:
@@ -226,7 +231,13 @@ def open_rig(config: RigConfig) -> Rig:
             name: CameraSettings(_exposure_s(camera.info, table_settings[name][0], config), table_settings[name][1])
             for name, camera in cameras.items()
         }
-        calibration = _calibration(config, head, projector, cameras)
+        try:
+            calibration = _calibration(config, head, projector, cameras)
+        except CalibrationError:
+            # Alone, what is left of the cameras may have no depth.
+            for error in (lost or {}).values():
+                raise error from None
+            raise
         rig = Rig(
             config.name,
             cameras,
@@ -234,18 +245,21 @@ def open_rig(config: RigConfig) -> Rig:
             settings,
             calibration,
             head,
-            _synchronisation(config, cameras),
+            _synchronisation(config, [*cameras, *(lost or {})]),
             _clock(head),
             positioner,
+            lost={name: str(error) for name, error in (lost or {}).items()},
         )
         opened.pop_all()
         return rig
 
 
 def _open_each(
-    config: RigConfig, opened: ExitStack
+    config: RigConfig, opened: ExitStack, lost: dict[str, SlrigError] | None
 ) -> tuple[ScannerHead | None, Projector, Mapping[str, Camera], Positioner | None]:
-    """Open every device of a rig; `opened` closes them again. Raises as `open_rig`."""
+    """Open every device of a rig; `opened` closes them again. lost : is filled with the errors of cameras that cannot
+    be opened while others can; None has them raised. Raises as `open_rig`.
+    """
     faults: list[ConfigError] = []
 
     def attempt(kind: str, table: DriverTable, protocol: type[Any], *name: str) -> Any:
@@ -254,11 +268,14 @@ def _open_each(
         except ConfigError as error:
             faults.append(error)
             return None
-        except SlrigError:
+        except SlrigError as error:
             # After a fault of the file, the other devices are opened only to collect their faults of the file.
             if faults:
                 return None
-            raise
+            if kind != "camera" or lost is None:
+                raise
+            lost.update(dict.fromkeys(name, error))
+            return None
         for each in (device.projector, *device.cameras.values()) if kind == "head" else (device,):
             opened.callback(_close_quietly, each)
         return device
@@ -270,6 +287,9 @@ def _open_each(
             raise ConfigError(message)
         projector = attempt("projector", config.projector, Projector)
         cameras = {table.name: attempt("camera", table, Camera, table.name) for table in config.cameras}
+        if lost and len(lost) == len(cameras):
+            raise next(iter(lost.values()))
+        cameras = {name: camera for name, camera in cameras.items() if name not in (lost or {})}
     positioner = _head_positioner(head)
     if config.positioner is not None:
         if positioner is not None:
@@ -303,7 +323,7 @@ def _head_positioner(head: object) -> Positioner | None:
     return head.positioner if isinstance(head, HasPositioner) else None
 
 
-def _synchronisation(config: RigConfig, cameras: Mapping[str, Camera]) -> Synchronisation | None:
+def _synchronisation(config: RigConfig, cameras: Collection[str]) -> Synchronisation | None:
     table = config.synchronisation
     if table is None:
         return None

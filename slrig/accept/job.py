@@ -199,7 +199,7 @@ class PositionJob(Job):
 
     def capture(self, rig: RigSession, run: JobRun) -> None:
         """Have the artefact placed, and record a bundle of each capture."""
-        opened, record = rig.open(), read_test(_test_of(run))
+        opened, record = rig.open_whole(), read_test(_test_of(run))
         plan = record.plan
         if required_calibration(opened).solve_id != record.calibration:
             message = (

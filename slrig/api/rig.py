@@ -103,6 +103,7 @@ def look_at_rig(service: Serving) -> RigBody:
         positions=[] if facts is None else facts.positions,
         turntable=facts is not None and facts.turntable,
         cameras=[] if facts is None else [_camera(*each, settings.get(each[0])) for each in facts.cameras.items()],
+        lost_cameras={} if facts is None else facts.lost,
         projector=None if facts is None else filled(ProjectorBody, facts.projector, size_px=facts.projector.size),
         scan_defaults=service.scan_defaults.model_dump(exclude_none=True),
         fleet=service.copier is not None,

@@ -530,6 +530,10 @@ class RigBody(BaseModel):
     positions: list[str] = Field(description="poses that the rig's positioner can take; none where a person does")
     turntable: bool = Field(description="the positioner turns what stands on it to any angle")
     cameras: list[CameraBody]
+    lost_cameras: dict[str, str] = Field(
+        description="cameras of the rig file that could not be opened, each with the reason; scans go on without them, "
+        "and the next work tries again"
+    )
     projector: ProjectorBody | None
     holder: str | None = Field(description="who holds the rig: the id of a scan, or other work by name")
     since: datetime | None

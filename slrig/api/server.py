@@ -357,7 +357,7 @@ def open_service(
         manager = JobManager(
             JobStore(database, outbox=outbox),
             folder,
-            RigSession(rig.name, lambda: open_rig(rig), table_at=folder.root / TURNTABLE / "table.json"),
+            RigSession(rig.name, lambda: open_rig(rig, may_lose=True), table_at=folder.root / TURNTABLE / "table.json"),
             worker,
             *KINDS,
             queue_length=settings.queue_length,

@@ -105,7 +105,7 @@ class PoseJob(Job):
 
     def capture(self, rig: RigSession, run: JobRun) -> Recording:
         """Move the board if asked, and record a bundle."""
-        opened = rig.open()
+        opened = rig.open_whole()
         if self.position is not None and opened.positioner is not None:
             run.report("move", 0.0, self.position_name or "")
             opened.positioner.move(self.position)
@@ -292,7 +292,7 @@ class AxisJob(Job):
 
     def capture(self, rig: RigSession, run: JobRun) -> None:
         """Turn the board, and record a bundle at each angle; at the end the turntable is where it was."""
-        opened = rig.open()
+        opened = rig.open_whole()
         table = opened.positioner
         if not isinstance(table, Turntable):
             raise no_turntable(self.step_deg)

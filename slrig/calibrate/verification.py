@@ -105,7 +105,7 @@ class VerificationJob(Job):
 
     def capture(self, rig: RigSession, run: JobRun) -> Recording:
         """Move the board if asked, and record a bundle with the calibration that is to be verified."""
-        opened = rig.open()
+        opened = rig.open_whole()
         if self.position is not None and opened.positioner is not None:
             opened.positioner.move(self.position)
         # A verification must not use what a rendered rig knows of its scene.

@@ -207,7 +207,8 @@ class Rig:
 
     `synchronisation` is None if latency was not measured. `clock` is the clock of all time stamps. `positioner` is None
     if the user moves the calibration board. `paces_s` : the time from pulse to pulse that worked by wire, by the time
-    that patterns were lit and the time that was tried first; kept while the rig is open.
+    that patterns were lit and the time that was tried first; kept while the rig is open. `lost` : cameras of the rig
+    file that could not be opened, and why.
     """
 
     name: str
@@ -220,6 +221,7 @@ class Rig:
     clock: Clock = field(default_factory=SystemClock)
     positioner: Positioner | None = None
     paces_s: dict[tuple[float, float], float] = field(default_factory=dict)
+    lost: Mapping[str, str] = field(default_factory=dict)
 
     def truth(self) -> Truth | None:
         """Return the ground truth of a rendered scene; None for real hardware."""

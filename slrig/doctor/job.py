@@ -47,7 +47,7 @@ class DoctorJob(Job):
         """Examine the rig. What is measured next depends on what was found, so nothing is left to compute afterwards.
         The summary is the `Diagnosis`. Raises DeviceError, and as the rig's drivers do.
         """
-        opened = rig.open()
+        opened = rig.open_whole()
         run.step("looking for displays", 0.0, "")
         # Light engines, trigger boxes, and outputs with a display.
         projectors = {driver.name for driver in installed_drivers() if driver.kind == "projector"}
@@ -90,7 +90,7 @@ class LatencyJob(Job):
 
     def capture(self, rig: RigSession, run: JobRun) -> Outcome:
         """Flash the projector, and fit latency and line time of each camera. Raises DeviceError, ScanEvidenceError."""
-        opened = rig.open()
+        opened = rig.open_whole()
         measured = measure_latency(
             opened, trials=self.trials, search_s=self.search_s, exposure_s=self.exposure_s, trigger=self.trigger,
             on_progress=run.step,

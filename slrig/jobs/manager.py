@@ -603,6 +603,7 @@ class JobManager:
         self.data.stage(work.id)
         try:
             with driver_errors(rig.name):
+                rig.find_lost()
                 rig.open()
                 # Before, the rig may not have been open, or may have had another calibration.
                 self.require_space(job.check(rig))

@@ -23,6 +23,7 @@ function ThisRig(given) {
   return html`<h2>This rig</h2>
     ${rig.error && html`<${Refusal} problem=${{document: {title: "The rig is not open"}, message: rig.error}}><p>Put that right, then open the rig again; the next scan tries, too.</p><//>`}
     ${!rig.open && !rig.error && html`<p role="status">The rig is being opened …</p>`}
+    ${Object.entries(rig.lost_cameras ?? {}).map(([name, why]) => html`<p class="warning" key=${name}>Camera ${name} cannot be opened, and scans go on without it: ${why}. The next scan looks for it again.</p>`)}
     <ul class="cards">${cameras.map((camera) => html`<li class="box" key=${camera.name}><${Camera} camera=${camera} /></li>`)}
       ${projector && html`<li class="box"><h3>Projector${projector.name === "projector" ? "" : ` ${projector.name}`}</h3><${Facts} of=${[
         ["Model", projector.model],

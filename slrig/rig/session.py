@@ -7,7 +7,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -144,7 +144,7 @@ class RigFacts:
 
     calibration : of the rig file, or of the head. positions : the poses that what moves the board can take, by name;
     none where a person does. turntable : whether it turns what stands on it to any angle. axis : where its maker says
-    that it turns, in the frame of `calibration`; None where that is not known.
+    that it turns, in the frame of `calibration`; None where that is not known. lost : as of `Rig`.
     """
 
     cameras: Mapping[str, CameraInfo]
@@ -153,6 +153,7 @@ class RigFacts:
     positions: tuple[str, ...] = ()
     turntable: bool = False
     axis: RotationAxis | None = None
+    lost: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def sizes(self) -> Mapping[str, Size]:
@@ -214,7 +215,9 @@ class RigSession:
         self._dropped = False
 
     def open(self) -> Rig:
-        """Return the rig, opened if it is not open yet. Raises what the driver raises, an OSError as DeviceError."""
+        """Return the rig, opened if it is not open yet, perhaps without some of its cameras: see `Rig.lost`.
+        Raises what the driver raises, an OSError as DeviceError.
+        """
         self._drop_failed()
         if self._rig is None:
             self._dropped = False
@@ -230,6 +233,8 @@ class RigSession:
                     self._close(rig)
                 raise
             self._rig, self._bare = opened, rig
+            for name, cause in rig.lost.items():
+                _log.warning("a camera cannot be opened; the rig goes on without it", camera=name, cause=cause)
             if self._table_at is not None and isinstance(self._rig.positioner, Turntable):
                 table = CountedTurntable(self._rig.positioner, self._table_at)
                 self._rig = replace(self._rig, positioner=table)
@@ -237,6 +242,19 @@ class RigSession:
             self.fault = None
         active = self.active
         return self._rig if active is None else replace(self._rig, calibration=self._fitting(active))
+
+    def open_whole(self) -> Rig:
+        """As `open`, for work that needs every camera. Raises DeviceError: one cannot be opened."""
+        rig = self.open()
+        if rig.lost:
+            message = f"this needs every camera of the rig: {'; '.join(rig.lost.values())}"
+            raise DeviceError(message)
+        return rig
+
+    def find_lost(self) -> None:
+        """Close a rig without some of its cameras, so that the next work opens it with those that are back."""
+        if self._rig is not None and self._rig.lost:
+            self.let_go()
 
     @property
     def axis(self) -> RotationAxis | None:
@@ -330,6 +348,9 @@ class RigSession:
         self.let_go()
         self._dropped = True
         self._bare = self._opened()
+        if self._bare.lost:
+            self._close(self._bare)
+            raise DeviceError("; ".join(self._bare.lost.values()))
         return self._bare
 
     def reopen(self, open_rig: Callable[[], Rig], kept: Callable[[], None]) -> None:
@@ -413,4 +434,4 @@ def _facts(rig: Rig) -> RigFacts:
     positions = () if rig.positioner is None else tuple(rig.positioner.poses)
     table = rig.positioner if isinstance(rig.positioner, Turntable) else None
     axis = None if table is None else table.axis
-    return RigFacts(cameras, rig.projector.info, rig.calibration, positions, table is not None, axis)
+    return RigFacts(cameras, rig.projector.info, rig.calibration, positions, table is not None, axis, rig.lost)

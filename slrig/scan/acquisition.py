@@ -508,7 +508,7 @@ def capture_frames(
 
     `frames` is shown each frame that has passed its test, and once more the frames that took another one's place.
     health : of the rig's calibration, for the bundle. may_lose : whether to go on without a camera that fails or
-    sees nothing, as long as the others measure; the bundle's notes then say so.
+    sees nothing, as long as the others measure; the bundle's notes then say so, as of cameras that `rig` lacks.
 
     Raises
     ------
@@ -526,7 +526,7 @@ def capture_frames(
     """
     sequence = rig_sequence(plan, rig)
     rig, exposures_s, told = exposed(rig, plan)
-    told += _of_the_rig(rig)
+    told = [*lost_words(rig.lost), *told, *_of_the_rig(rig)]
     for words in told:
         _log.info(words, rig=rig.name)
         listener.report("capture", 0.0, words)

@@ -185,10 +185,10 @@ def _camera(name: str, driver: str = "fake", more: str = "") -> str:
     return f'[[camera]]\nname = "{name}"\ndriver = "{driver}"\n{more}\n'
 
 
-def _open(folder: Path, *cameras: str, top: str = "", projector: str = "fake") -> Rig:
+def _open(folder: Path, *cameras: str, top: str = "", projector: str = "fake", may_lose: bool = False) -> Rig:
     text = f'name = "bench"\n{top}\n[projector]\ndriver = "{projector}"\nport = 3\n' + "".join(cameras)
     (folder / "rig.toml").write_text(text)
-    return open_rig(read_rig(folder / "rig.toml"))
+    return open_rig(read_rig(folder / "rig.toml"), may_lose=may_lose)
 
 
 def test_a_rig_is_opened_with_its_options(tmp_path: Path) -> None:
@@ -312,6 +312,23 @@ def test_devices_already_open_are_closed_when_one_fails(
     with pytest.raises(error, match=part):
         _open(tmp_path, _camera("left"), _camera("right", driver))
     assert [(device.name, device.closings) for device in OPENED] == [("projector", 1), ("left", 1)]
+    OPENED.clear()
+    timing = "[synchronisation]\nlatency_s = 0.01\nlatency_error_s = 0.0\nline_time_s = { right = 1e-5 }\n"
+    rig = _open(tmp_path, _camera("left"), _camera("right", driver), timing, may_lose=True)
+    assert list(rig.cameras) == list(rig.settings) == ["left"]
+    assert re.search(part, rig.lost["right"])
+    assert [(device.name, device.closings) for device in OPENED] == [("projector", 0), ("left", 0)]
+
+
+def test_without_what_can_measure_a_lost_camera_ends_the_opening(tmp_path: Path) -> None:
+    with pytest.raises(DeviceGoneError, match="left is not there"):
+        _open(tmp_path, _camera("left", "lost"), may_lose=True)
+    with pytest.raises(ConfigError, match="strict"):
+        _open(tmp_path, _camera("left"), _camera("right", "lost"), _camera("third", "strict"), may_lose=True)
+    write_calibration(tmp_path / "own.json", replace(sample_calibration(), projector=None))
+    with pytest.raises(DeviceGoneError, match="right is not there"):
+        _open(tmp_path, _camera("left"), _camera("right", "lost"), top='calibration = "own.json"', may_lose=True)
+    assert {device.closings for device in OPENED} == {1}
 
 
 @pytest.mark.parametrize(("how", "words"), [("fails", "unplugged"), ("breaks", "Input/output error")])

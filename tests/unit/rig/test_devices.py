@@ -442,6 +442,29 @@ def test_rig_with_a_failure_that_nobody_was_told_of_is_opened_afresh() -> None:
     assert len(bench.opened) == 3
 
 
+def test_a_lost_camera_is_looked_for_by_each_work_and_refuses_what_needs_all() -> None:
+    bench, lost = TameBench(), {"cam1": "no such camera"}
+    held = RigSession("bench", lambda: replace(bench.open_rig(), lost=dict(lost)))
+    with capture_logs() as logs:
+        held.open()
+    assert [each["camera"] for each in logs] == ["cam1"]
+    assert held.facts is not None
+    assert held.facts.lost == lost
+    with pytest.raises(DeviceError, match="needs every camera of the rig: no such camera"):
+        held.open_whole()
+    with pytest.raises(DeviceError, match="no such camera"):
+        held.open_for_checks()
+    assert bench.opened[-1][0].closed
+    with capture_logs():
+        held.open()
+    held.find_lost()
+    lost.clear()
+    assert held.open_whole() is held.open()
+    assert held.facts.lost == {}
+    held.find_lost()
+    assert len(bench.opened) == 4
+
+
 def test_light_is_put_out_past_a_call_that_hangs() -> None:
     bench = TameBench()
     held = RigSession("bench", bench.open_rig)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -69,6 +70,13 @@ def test_a_scan_goes_on_without_a_camera_that_is_lost_and_says_so(
     note = read_notes(tmp_path / "bundle")[0]
     assert note.startswith("camera 'right' was lost, and the scan went on without it: ")
     assert words in note
+
+
+def test_a_camera_that_could_not_be_opened_is_told_of(tmp_path: Path) -> None:
+    fake = rig_of({}, names=("left",))
+    captured(replace(fake, rig=replace(fake.rig, lost={"right": "no such camera"})), tmp_path / "bundle")
+    notes = read_notes(tmp_path / "bundle")
+    assert notes[0] == "camera 'right' was lost, and the scan went on without it: no such camera"
 
 
 @pytest.mark.parametrize("unplugged_at", [3, 22], ids=["first exposure", "second exposure"])
