@@ -7,9 +7,11 @@ are decided at the edges (`slrig.api.problems`, `slrig.cli`), never here.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 _FLAGS = {
     "exposures_s": "exposure-s",
