@@ -25,14 +25,14 @@ _MIN_SIGMA = 3.0
 class Viewpoints:
     """The devices that measured the points of a surface, by their centres of projection in the world, mm.
 
-    camera : (n,) int32, index of the camera whose pixel each point has; cameras_mm : (k, 3) float64.
-    second_mm : (3,) float64, the device with the second ray of every point: the projector, or in a pair of cameras
-    the second one. deviation_mm : (n, 3) float64, displacement of each point for one standard deviation.
+    centres_mm : (k, 3) float64. camera : (n,) int32, index of the camera whose pixel each point has; second : (n,)
+    int32, that of the device with its second ray: the projector, or in a pair of cameras the second one. deviation_mm :
+    (n, 3) float64, displacement of each point for one standard deviation.
     """
 
+    centres_mm: FloatArray
     camera: NDArray[np.int32]
-    cameras_mm: FloatArray
-    second_mm: FloatArray
+    second: NDArray[np.int32]
     deviation_mm: FloatArray
 
 
@@ -41,8 +41,8 @@ def facing_sides(points_mm: FloatArray, faces: IntArray, views: Viewpoints, /) -
     sees its back, 0 where they differ or one sees it edge-on.
     """
     sides = np.zeros(len(faces), dtype=np.int8)
-    given = np.ascontiguousarray(points_mm), np.ascontiguousarray(faces), views.camera, views.cameras_mm
-    in_bands(_sides, len(faces), *given, views.second_mm, sides)
+    given = np.ascontiguousarray(points_mm), np.ascontiguousarray(faces), views.camera, views.second, views.centres_mm
+    in_bands(_sides, len(faces), *given, sides)
     return sides
 
 
@@ -90,7 +90,7 @@ def _pieces_with(certain: NDArray[np.bool_], faces: IntArray, members: IntArray)
 def _is_certain(points_mm: FloatArray, faces: IntArray, views: Viewpoints) -> NDArray[np.bool_]:
     """(F,) bool: no device sees the triangle within three standard deviations of edge-on."""
     certain = np.ones(len(faces), dtype=np.bool_)
-    for index, centre_mm in enumerate((*views.cameras_mm, views.second_mm)):
+    for index, centre_mm in enumerate(views.centres_mm):
         a, b, c = (points_mm[faces[:, corner]] - centre_mm for corner in range(3))
         # Six times the volume between triangle and centre, and how it changes with each corner.
         slopes = np.cross(b, c), np.cross(c, a), np.cross(a, b)
@@ -98,25 +98,26 @@ def _is_certain(points_mm: FloatArray, faces: IntArray, views: Viewpoints) -> ND
         variance = np.zeros(len(faces))
         for corner, slope in enumerate(slopes):
             variance += np.einsum("ij,ij->i", slope, views.deviation_mm[faces[:, corner]]) ** 2
-        not_seen = (views.camera[faces] != index).all(axis=1) & (index < len(views.cameras_mm))
+        not_seen = ((views.camera[faces] != index) & (views.second[faces] != index)).all(axis=1)
         certain &= not_seen | (volume**2 > _MIN_SIGMA**2 * variance)
     return certain
 
 
 @kernel
-def _sides(first: int, last: int, points: Any, faces: Any, camera: Any, centres: Any, second: Any, sides: Any) -> None:
+def _sides(first: int, last: int, points: Any, faces: Any, camera: Any, second: Any, centres: Any, sides: Any) -> None:
     for face in range(first, last):
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
         ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
         vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
         x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        towards = x * (second[0] - points[a, 0]) + y * (second[1] - points[a, 1]) + z * (second[2] - points[a, 2])
-        least, most = towards, towards
+        least, most = np.inf, -np.inf
         for corner in range(3):
-            k = camera[faces[face, corner]]
-            if corner > 0 and k == camera[a]:
-                continue
-            px, py, pz = centres[k, 0] - points[a, 0], centres[k, 1] - points[a, 1], centres[k, 2] - points[a, 2]
-            towards = x * px + y * py + z * pz
-            least, most = min(least, towards), max(most, towards)
+            point = faces[face, corner]
+            for which in range(2):
+                k = camera[point] if which == 0 else second[point]
+                if corner > 0 and k == (camera[a] if which == 0 else second[a]):
+                    continue
+                px, py, pz = centres[k, 0] - points[a, 0], centres[k, 1] - points[a, 1], centres[k, 2] - points[a, 2]
+                towards = x * px + y * py + z * pz
+                least, most = min(least, towards), max(most, towards)
         sides[face] = 1 if least > 0.0 else -1 if most < 0.0 else 0

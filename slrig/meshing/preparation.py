@@ -36,7 +36,8 @@ def mesh_sample() -> None:
     depth = 400 + np.sin(curve / 3) * np.cos(along / 7) + 0.3 * random.standard_normal(len(curve))
     points = np.column_stack((curve, 0.5 * along, depth))
     bridge = np.zeros(len(points), dtype=np.bool_)
-    views = Viewpoints(np.zeros(len(points), dtype=np.int32), np.zeros((1, 3)), np.zeros(3), np.zeros_like(points))
+    camera = np.zeros(len(points), dtype=np.int32)
+    views = Viewpoints(np.zeros((1, 3)), camera, camera, np.zeros_like(points))
     surface = build_surface(
         points, offsets, curve.astype(np.float64), bridge, np.ones(len(points)), views, _LIMITS,
         on_step=lambda _: None,

@@ -81,6 +81,7 @@ from slrig.reconstruction.triangulation import (
     select_points,
     stripe_crossing,
     triangulate_camera_pair,
+    triangulate_camera_pairs,
     triangulate_camera_projector,
 )
 from slrig.reconstruction.uncertainty import (
@@ -182,6 +183,7 @@ __all__ = [
     "stripe_crossing",
     "stripe_tangents",
     "triangulate_camera_pair",
+    "triangulate_camera_pairs",
     "triangulate_camera_projector",
     "used_frames",
     "used_shots",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ _ROWS = 19
 _MAX_POINTS = 20_000  # their median is known to a hundredth of their scatter
 _STEP = 1e-3  # of the baseline: far above rounding, and an epipolar line is straight over so short a distance
 
+_AGAIN = 2.5  # times the usual distance to the nearest point of the other camera, and of neighbours along a stripe
 _PROBE_PX = 1e-3  # far above rounding, and a point moves straight over so short a distance
 _BORDER_PX = 2.0  # beyond the projector's image; chosen: 0 and 4 make no difference
 
@@ -420,13 +422,82 @@ def triangulate_camera_projector(
 def triangulate_camera_pair(
     first: StripeEnsemble, second: StripeEnsemble, camera: Pinhole, other: Pinhole, /
 ) -> tuple[SheetCurves, NDArray[np.bool_]]:
-    """Triangulate points of `first` with the curve of the same position in `second`, without projector calibration.
+    """As `triangulate_camera_pairs` with one other camera. Also returns (n,) bool: points of the ensemble that have a
+    partner.
+    """
+    curves, _, valid = triangulate_camera_pairs(first, camera, [(second, other)])
+    return curves, valid
+
+
+def triangulate_camera_pairs(
+    first: StripeEnsemble, camera: Pinhole, others: Sequence[tuple[StripeEnsemble, Pinhole]], /
+) -> tuple[SheetCurves, NDArray[np.int32], NDArray[np.bool_]]:
+    """Triangulate points of `first` with the curves of the same position in others, without projector calibration.
 
     The epipolar line of each point is intersected with the other camera's curve between two consecutive points that no
     bridge separates. The two rays then meet in the least-squares sense. Curves run by the rows of `camera`, or by its
-    columns if the stripes run rather across the image than down. Also returns (n,) bool: points of the ensemble that
-    have a partner.
+    columns if the stripes run rather across the image than down.
+
+    A point is met with the camera that most points meet for their standard deviation, or else with the next: the mean
+    of two would share the error of its own pixel. Also returns (m,) int32: index of the other camera of each point; and
+    (n,) bool: points of the ensemble that have a partner.
     """
+    met = [_met(first, second, camera, other) for second, other in others]
+    partner = np.full(len(first.points_px), -1, dtype=np.int32)
+    points, deviation = (np.full((len(partner), 3), np.nan) for _ in range(2))
+    for index in sorted(range(len(met)), key=lambda index: -_worth(*met[index][1:])):
+        points_mm, deviation_mm, valid = met[index]
+        new = valid & (partner < 0)
+        new &= _met_back(points_mm, new, first, camera, *others[index])
+        points[new], deviation[new], partner[new] = points_mm[new], deviation_mm[new], index
+    curves = SheetCurves(
+        offsets=first.offsets,
+        position_px=first.position_px,
+        points_mm=points,
+        deviation_mm=deviation,
+        along_px=first.points_px[:, 1 if runs_down(first) else 0].copy(),
+        pixels_px=first.points_px,
+        stripe=first.stripe,
+        bridge_after=first.bridge_after,
+        source=partner.astype(np.uint8),  # takes part in the order
+    )
+    curves = order_along_sheet(select_points(curves, partner >= 0))
+    pair = np.full(len(curves.source), Source.CAMERA_CAMERA, dtype=np.uint8)
+    return replace(curves, source=pair), curves.source.astype(np.int32), partner >= 0
+
+
+def _worth(deviation_mm: FloatArray, valid: NDArray[np.bool_]) -> float:
+    """Number of points over their usual standard deviation."""
+    return (
+        np.count_nonzero(valid) / float(np.median(np.linalg.norm(deviation_mm[valid], axis=1))) if valid.any() else 0.0
+    )
+
+
+def _met_back(
+    points_mm: FloatArray, new: NDArray[np.bool_], first: StripeEnsemble, camera: Pinhole, second: StripeEnsemble,
+    other: Pinhole,
+) -> NDArray[np.bool_]:  # fmt: skip
+    """(n,) bool: points that the other camera finds again when its own are met with the first's.
+
+    What the other camera does not see may meet the part of the stripe that it sees on another surface.
+    """
+    # Half a second to load, and few scans need it.
+    from scipy.spatial import cKDTree
+
+    back_mm, _, valid = _met(second, first, other, camera)
+    found = np.zeros(len(points_mm), dtype=np.bool_)
+    if valid.any() and new.any():
+        back_mm = back_mm[valid]
+        apart_mm, _ = cKDTree(back_mm).query(points_mm[new])
+        steps_mm = np.linalg.norm(np.diff(back_mm, axis=0), axis=1)
+        found[new] = apart_mm <= _AGAIN * np.median(np.concatenate([apart_mm, steps_mm]))
+    return found
+
+
+def _met(
+    first: StripeEnsemble, second: StripeEnsemble, camera: Pinhole, other: Pinhole
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """(n, 3) points of `first`, (n, 3) displacement for one standard deviation, and (n,) bool: where there is any."""
     shared, own_index, other_index = np.intersect1d(first.position_px, second.position_px, return_indices=True)
     del shared
     partner = np.full(len(first.position_px), -1, dtype=np.int32)
@@ -440,18 +511,7 @@ def triangulate_camera_pair(
         second.offsets, second.points_px, second.normals, second.sigma_px, second.bridge_after,
         points, deviation, valid,
     )  # fmt: skip
-    curves = SheetCurves(
-        offsets=first.offsets,
-        position_px=first.position_px,
-        points_mm=points,
-        deviation_mm=deviation,
-        along_px=first.points_px[:, 1 if runs_down(first) else 0].copy(),
-        pixels_px=first.points_px,
-        stripe=first.stripe,
-        bridge_after=first.bridge_after,
-        source=np.full(len(points), Source.CAMERA_CAMERA, dtype=np.uint8),
-    )
-    return order_along_sheet(select_points(curves, valid)), valid
+    return points, deviation, valid
 
 
 @kernel_part

@@ -258,7 +258,8 @@ def calibration_sigma(
     """(n,) float64: standard deviation along the surface normal by the calibration, mm.
 
     points_mm : (n, 3); normals : (n, 3), unit; source : (n,) `Source`; camera : (n,), index of the camera of the point.
-    seen_by : (n,), one bit for each camera that measured it, for points of several.
+    seen_by : (n,), one bit for each camera that measured it, for points of several; without a projector, for the first
+    camera and the one that it was paired with.
     tangents : (n, 3), direction of the stripe in space, needed for points of two cameras only; without it the stripe is
     assumed perpendicular to the epipolar line. Without a normal, the standard deviation along the viewing ray is
     returned, practically an upper bound.
@@ -375,8 +376,12 @@ def _sigma_kernel(
         line[:] = 0.0
         valid = True
         if source[i] == _CAMERA_CAMERA:
-            a, b = stripe_normal(devices, second, point, tangents[i], g)
-            valid = add_sensitivity(devices, 0, second, a, b, 1.0, point, normal, g, line)
+            partner = second
+            for index in range(1, len(devices)):
+                if (seen_by[i] >> index) & 1:
+                    partner = index
+            a, b = stripe_normal(devices, partner, point, tangents[i], g)
+            valid = add_sensitivity(devices, 0, partner, a, b, 1.0, point, normal, g, line)
         else:
             a, b = 0.0 if row else 1.0, 1.0 if row else 0.0
             measured = 0.0

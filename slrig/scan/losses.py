@@ -360,7 +360,8 @@ def refuse_mirror_images(
             part.points_mm, part.offsets, part.position_px, part.bridge_after,
             np.hypot(sampling, np.linalg.norm(part.deviation_mm, axis=1)),
             Viewpoints(
-                np.zeros(count, dtype=np.int32), seen.device.centre_mm[None], projector.centre_mm, part.deviation_mm
+                np.stack([seen.device.centre_mm, projector.centre_mm]), np.zeros(count, dtype=np.int32),
+                np.ones(count, dtype=np.int32), part.deviation_mm,
             ),
             widest_step_px=step_px, depth_edge_ratio=ReconstructionPlan().depth_edge_ratio, keep_holes=False,
         )  # fmt: skip

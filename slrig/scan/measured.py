@@ -61,6 +61,7 @@ from slrig.reconstruction import (
     stripe_crossing,
     stripe_tangents,
     triangulate_camera_pair,
+    triangulate_camera_pairs,
     triangulate_camera_projector,
 )
 from slrig.scan.agreement import (
@@ -104,8 +105,9 @@ class Triangulated:
     their devices are those of the calibration of `agreement`. baseline_sine : 0 to 1, the sine of the angle between the
     stripes and the baseline: by the calibration, or without a projector as the median over the image. agreement : what
     the cameras say of the calibration, and the devices that the points were made with. notes : sentences for a person.
-    second : index of the camera that the first is paired with, without a projector. mirror_images : those of several
-    cameras, which were left out before their points were merged. widest_gap_px : of the function of that name.
+    second : index of the camera that most points of the first are paired with, without a projector. mirror_images :
+    those of several cameras, which were left out before their points were merged. widest_gap_px : of the function of
+    that name.
     """
 
     merged: MergedCurves
@@ -133,8 +135,8 @@ def triangulate_cameras(
     With a projector, a camera is left out whose baseline lies along the stripes: it sees the light sheets edge on.
     Cameras that contradict each other are not merged, see `slrig.scan.agreement`.
 
-    Without a projector one pair of cameras is used, since the light sheet has no rows to merge several by: of the pairs
-    with the first camera whose stripes cross the epipolar lines steeply, the one that gives most points.
+    Without a projector the points are those of the first camera, since the light sheet has no rows to merge several by:
+    each is met with one of the cameras whose stripes cross the epipolar lines steeply.
 
     Raises
     ------
@@ -196,7 +198,7 @@ def _triangulate_sheets(
             cause = np.where(cause == Refusal.NONE, np.uint8(Refusal.SHEET_SEEN_ALONG), cause)
         refusal = _with_left_out(camera.curves, part, cause)
         if region is not None:
-            part, refusal = limited(region, part, refusal, camera.device)
+            part, refusal, _ = limited(region, part, refusal, camera.device)
         camera, part = leave_out_contradicted(
             replace(camera, curves=replace(camera.curves, refusal=refusal)), part, projector, axis,
             checks.get(camera.name),
@@ -211,44 +213,44 @@ def _triangulate_sheets(
 def _triangulate_pair(
     cameras: Sequence[CameraResult], calibration: Calibration, axis: Axis, region: Region | None
 ) -> Triangulated:
-    """Points of the first camera and the one that it is paired with, without a projector."""
+    """Points of the first camera, each with one of those that it is paired with, without a projector."""
     first, *others = cameras
     stripes = first.curves.ensemble
     crossing = [stripe_crossing(stripes, first.device, other.device) for other in others]
     steep = [index for index, sine in enumerate(crossing) if sine >= _STEEP_ENOUGH * max(crossing)]
-    pairs = {
-        index: triangulate_camera_pair(stripes, others[index].curves.ensemble, first.device, others[index].device)
-        for index in steep
-    }
-    partner = max(pairs, key=lambda index: len(pairs[index][0].points_mm))
-    points, matched = pairs[partner]
-    second = others[partner]
-    _, matched_back = triangulate_camera_pair(second.curves.ensemble, stripes, second.device, first.device)
+    paired = [others[index] for index in steep]
+    points, partner, matched = triangulate_camera_pairs(
+        stripes, first.device, [(other.curves.ensemble, other.device) for other in paired]
+    )
+    partner = np.array(steep, dtype=np.int32)[partner] + 1
     marked = [_with_cause(first, stripes.points_px, matched)]
     for index, other in enumerate(others):
-        is_matched = (
-            matched_back if index == partner else np.zeros(len(other.curves.ensemble.points_px), dtype=np.bool_)
-        )
-        marked.append(_with_cause(other, other.curves.ensemble.points_px, is_matched))
+        ensemble = other.curves.ensemble
+        is_matched = np.zeros(len(ensemble.points_px), dtype=np.bool_)
+        if index in steep:
+            _, is_matched = triangulate_camera_pair(ensemble, stripes, other.device, first.device)
+        marked.append(_with_cause(other, ensemble.points_px, is_matched))
     if region is not None:
-        points, refusal = limited(region, points, marked[0].curves.refusal, first.device)
+        points, refusal, kept = limited(region, points, marked[0].curves.refusal, first.device)
+        partner = partner[kept]
         marked[0] = replace(marked[0], curves=replace(marked[0].curves, refusal=refusal))
-    gap = widest_gap_px(None, axis, [points])
+    second = int(np.bincount(partner).argmax()) if len(partner) else steep[0] + 1
+    gap, none = widest_gap_px(None, axis, [points]), np.zeros(0)
     devices = {camera.name: camera.device for camera in cameras}
     redundancy = evaluate_redundancy([points], devices, axis, widest_gap_px=gap)
-    notes = []
+    notes, names = [], " or ".join(f"'{other.name}'" for other in paired)
     if len(matched) and (alone := 1 - float(matched.mean())) > _MANY_ALONE:
         notes.append(
-            f"{alone:.0%} of the points of camera '{first.name}' have no partner in camera '{second.name}': the "
+            f"{alone:.0%} of the points of camera '{first.name}' have no partner in camera {names}: the "
             "cameras see too little of the same surface, or their calibration is wrong (verify it: slrig verify)"
         )
     return Triangulated(
-        merge_curves([points], first.device.centre_mm, widest_gap_px=gap),
+        MergedCurves(points, np.zeros(len(partner), dtype=np.int32), 1 | (1 << partner.astype(np.int64)), none, none),
         _without_points(marked),
-        crossing[partner],
+        crossing[second - 1],
         Agreement(calibration, (True,) * len(cameras), redundancy),
         tuple(notes),
-        1 + partner,
+        second,
         widest_gap_px=gap,
     )
 

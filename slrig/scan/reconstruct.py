@@ -386,13 +386,13 @@ def _meshed(
         cameras, merged, step_px, walked.cell_px, max_gap=plan.max_code_gap, widest_gap_px=found.widest_gap_px
     )
     sampling = sampling_mm(points.points_mm, first.device, projector, axis, spacing.at_points_px)
-    second = cameras[found.second].device if projector is None else projector
-    views = Viewpoints(
-        merged.camera,
-        np.stack([camera.device.centre_mm for camera in cameras]),
-        second.centre_mm,
-        points.deviation_mm,
-    )
+    centres_mm = [
+        *(camera.device.centre_mm for camera in cameras),
+        *([] if projector is None else [projector.centre_mm]),
+    ]
+    # Without a projector, the other camera is the last that measured the point.
+    second = np.full(len(merged.camera), len(cameras)) if projector is not None else np.frexp(merged.seen_by)[1] - 1
+    views = Viewpoints(np.stack(centres_mm), merged.camera, second.astype(np.int32), points.deviation_mm)
     surface = build_surface(
         points.points_mm, points.offsets, points.position_px, points.bridge_after,
         # Two points of one place are as far apart as noise has them.

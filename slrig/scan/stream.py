@@ -181,10 +181,12 @@ def frame_part(
 
 def limited(
     region: Region, curves: SheetCurves, refusal: NDArray[np.uint8], device: Pinhole
-) -> tuple[SheetCurves, NDArray[np.uint8]]:
-    """The points of a camera that the region holds, and its refusals, (H, W), with the others among them."""
+) -> tuple[SheetCurves, NDArray[np.uint8], NDArray[np.bool_]]:
+    """The points of a camera that the region holds, its refusals, (H, W), with the others among them, and (n,) bool:
+    which points it holds.
+    """
     kept = within(region, curves.points_mm, curves.pixels_px, refusal, device)
-    return select_points(curves, kept), marked(refusal, curves.pixels_px, kept)
+    return select_points(curves, kept), marked(refusal, curves.pixels_px, kept), kept
 
 
 def within(

@@ -112,3 +112,20 @@ def test_sigma_holds_where_all_three_measured(whole: Scan) -> None:
         assert 0.64 <= within.mean() <= 0.8, number
     spread = [float(np.median(mesh.sigma_mm[counts == number])) for number in (2, 3)]
     assert spread[1] < spread[0]
+
+
+def test_without_the_projectors_calibration_both_pairs_of_the_first_camera_are_used(
+    whole: Scan, tmp_path: Path
+) -> None:
+    document = json.loads((whole.bundle / "calibration.json").read_text())
+    del document["projector"]
+    (tmp_path / "calibration.json").write_text(json.dumps(document))
+    shares = []
+    for names in (NAMES, ("above", "right")):
+        bundle = with_cameras(whole.bundle, tmp_path, names).parent
+        report = reconstructed(bundle, tmp_path / "-".join(names) / "alone", calibration=tmp_path / "calibration.json")
+        assert report["truth"]["gross_fraction"] < 0.001
+        assert 0.85 <= report["truth"]["error_over_sigma_p68"] <= 1.1
+        shares.append(report["truth"]["complete_0.1mm"])
+    # The camera at the left sees what the one at the right does not, at a poor angle.
+    assert shares[0] > shares[1] + 0.04

@@ -34,7 +34,8 @@ def meshed(
         np.zeros(len(points), dtype=np.bool_) if bridge_after is None else bridge_after,
         np.ones(len(points)),
         Viewpoints(
-            np.zeros(len(points), dtype=np.int32) if camera is None else camera, np.atleast_2d(eyes_mm), second_mm,
+            np.vstack([eyes_mm, second_mm]), np.zeros(len(points), dtype=np.int32) if camera is None else camera,
+            np.full(len(points), len(np.atleast_2d(eyes_mm)), dtype=np.int32),
             np.full((len(points), 3), (0.0, 0.0, sigma_mm)),
         ),
         widest_step_px=widest_step_px, depth_edge_ratio=6.0, keep_holes=keep_holes,

@@ -16,7 +16,8 @@ EYE_MM = np.array([0.0, 0.0, -500.0])
 
 def from_eye(points: FloatArray) -> Viewpoints:
     """Camera and projector stand in one place."""
-    return Viewpoints(np.zeros(len(points), dtype=np.int32), EYE_MM[None], EYE_MM, np.zeros_like(points))
+    camera = np.zeros(len(points), dtype=np.int32)
+    return Viewpoints(EYE_MM[None], camera, camera, np.zeros_like(points))
 
 
 LIMITS = MeshingLimits(
@@ -112,8 +113,8 @@ def test_no_triangle_faces_away_in_the_end() -> None:
     # Deep noise, seen from aside: flips fold some triangles over.
     points, offsets = jagged_curves()
     points[:, 2] += np.random.default_rng(0).normal(0, 0.8, len(points))
-    views = replace(from_eye(points), cameras_mm=np.array([[-300.0, 40.0, -150.0]]))
-    views = replace(views, deviation_mm=np.full_like(points, 5.0))
+    views = replace(from_eye(points), centres_mm=np.array([[-300.0, 40.0, -150.0], EYE_MM]))
+    views = replace(views, second=views.second + 1, deviation_mm=np.full_like(points, 5.0))
     made = build_surface(
         points, offsets, np.arange(len(offsets) - 1.0), np.zeros(len(points), dtype=bool), np.ones(len(points)), views,
         LIMITS, on_step=lambda _: None,

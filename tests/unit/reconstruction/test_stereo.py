@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from slrig.model import FloatArray, Pinhole, Size
-from slrig.reconstruction.triangulation import triangulate_camera_pair
+from slrig.reconstruction.triangulation import triangulate_camera_pair, triangulate_camera_pairs
 from tests.unit.reconstruction.builders import (
     BALL,
     CAMERA,
     OTHER_CAMERA,
+    PROJECTOR,
     lit_rows,
     looking,
     opencv_pixels,
@@ -102,3 +103,25 @@ def test_a_camera_without_parallax_gives_nothing() -> None:
         seen_on_ball(CAMERA, COLUMNS, ROWS), seen_on_ball(turned, COLUMNS, ROWS), CAMERA, turned
     )
     assert len(curves.points_mm) == 0
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_of_several_cameras_the_most_exact_meets_a_point_and_others_fill_in_what_it_does_not_see(
+    order: tuple[int, int],
+) -> None:
+    near = replace(OTHER_CAMERA, translation_mm=OTHER_CAMERA.translation_mm + np.array([1.0, 0.0, 0.0]))
+    others = [
+        # More points, and each is less exact.
+        (seen_on_ball(near, COLUMNS, ROWS[ROWS > 80] + 0.55, sigma_px=0.2), near),
+        (seen_on_ball(OTHER_CAMERA, COLUMNS, ROWS[ROWS < 150] + 0.55), OTHER_CAMERA),
+    ]
+    first = seen_on_ball(CAMERA, COLUMNS, ROWS)
+    curves, partner, matched = triangulate_camera_pairs(first, CAMERA, [others[index] for index in order])
+    assert matched.mean() > 0.97
+    assert len(partner) == len(curves.points_mm) == np.count_nonzero(matched)
+    assert np.abs(BALL.distance_mm(curves.points_mm)).max() < 2e-3
+    rows = opencv_pixels(PROJECTOR, curves.points_mm)[:, 1]
+    assert (partner[rows < 147] == order.index(1)).all()
+    assert (partner[rows > 152] == order.index(0)).all()
+    within = np.diff(curves.curve_of_point()) == 0
+    assert (np.diff(curves.along_px)[within] > 0).all()
