@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
@@ -122,7 +123,8 @@ def test_job_is_a_trace_with_a_span_for_each_stage(collector: Collector, tmp_pat
 def test_service_sends_each_of_its_jobs(collector: Collector, tmp_path: Path) -> None:
     served = ServedBench(tmp_path)
     served.gate.set()
-    with client_of(served) as client:
+    with ExitStack() as after, client_of(served) as client:
+        after.callback(served.unpatch)
         scans = [client.post("/scan").json()["id"]]
         ended(client, scans[0])
     _, spans = collector.spans()
