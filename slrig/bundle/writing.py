@@ -65,6 +65,7 @@ class BundleWriter:
         self._projector = projector_size
         self._patterns = tuple(patterns)
         self._cameras = dict(cameras)
+        self._lost: set[str] = set()
         self._calibration = calibration
         self._captured_at = captured_at
         self._slots: list[_FrameSlot] = []
@@ -134,6 +135,10 @@ class BundleWriter:
         entry |= {"cause": refused.cause, "left_out": refused.left_out or None}
         self._refused.append(RefusedEntry.model_validate(entry))
 
+    def lose(self, camera: str) -> None:
+        """Leave a camera out of the bundle, of which no frame counts."""
+        self._lost.add(camera)
+
     def keep(self, ended: str) -> None:
         """Keep the written frames although the block will end with an error; `ended` is its message."""
         self._ended = ended
@@ -153,8 +158,6 @@ class BundleWriter:
 
     def _commit(self) -> None:
         frames = [slot.frame for slot in self._slots if not slot.vacant]
-        # A camera that was lost has none that count.
-        there = self._cameras if self._ended is not None else {frame["camera"] for frame in frames}
         if not frames and self._ended is None:
             raise BundleError(f"{self.folder}: expected frames, found none; a bundle holds at least one frame")
         data: dict[str, Any] = {
@@ -164,7 +167,7 @@ class BundleWriter:
             "cameras": {
                 name: {"size_px": _extent(camera.size), "bit_depth": camera.bit_depth}
                 for name, camera in self._cameras.items()
-                if name in there
+                if name not in self._lost
             },
             "patterns": [_pattern_document(pattern) for pattern in self._patterns],
             "frames": frames,

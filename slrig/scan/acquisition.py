@@ -560,6 +560,8 @@ def capture_frames(
                 "the others"
             )
             raise type(error)(message) from error
+        for name in exposing.lost:
+            writer.lose(name)
         if frames is not None:
             frames.end(exposing.summary())
         notes = [*lost_words(exposing.lost), *told]

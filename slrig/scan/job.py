@@ -117,7 +117,8 @@ class ScanJob(Job):
     def capture(self, rig: RigSession, run: JobRun) -> Recording:
         """Record a bundle, and show its frames to the worker meanwhile, if their devices are calibrated."""
         if self.plan.reconstruction.uncalibrated is not None:
-            return capture_frames(replace(rig.open(), calibration=None), self.plan, run.recording, run, may_lose=True)
+            # A calibration of some of the cameras would be in use for all.
+            return capture_frames(replace(rig.open_whole(), calibration=None), self.plan, run.recording, run)
         return capture_frames(
             rig.open(), self.plan, run.recording, run, frames=run.frames, health=rig.health(), may_lose=True
         )

@@ -110,7 +110,7 @@ def _solved_calibrations(draw: st.DrawFn) -> Calibration:
     box = np.array(draw(st.tuples(*[finite] * 6))).reshape(2, 3)
     # Offsets of whole minutes, as ISO 8601 has them: local mean times before 1972 have seconds.
     moment = draw(st.datetimes(min_value=datetime(1972, 2, 1), timezones=st.timezones())).isoformat()  # noqa: DTZ001
-    solved = SolveRecord(draw(texts), moment, root @ root.T, box, draw(st.floats(0, 1e300)))
+    solved = SolveRecord(draw(texts), moment, root @ root.T, box, draw(st.floats(0, 1e60)))
     return replace(calibration, solved=solved)
 
 

@@ -81,8 +81,8 @@ def test_the_rules_of_the_mesh_are_read(tmp_path: Path) -> None:
 def test_scan_defaults_are_the_fields_of_a_plan() -> None:
     plan = {field.name for part in (PatternPlan, ReconstructionPlan, ScanPlan) for field in fields(part)}
     # A pose may be shot without codes, a scan may not; a request makes a series, names a preset and turns a stage, no
-    # rig file.
-    of_requests = {"series", "preset", "turn_deg", "turned_by", "rig_in_base"}
+    # rig file; a rig that is guessed has no calibration to give.
+    of_requests = {"series", "preset", "turn_deg", "turned_by", "rig_in_base", "uncalibrated"}
     assert set(ScanDefaults.model_fields) == plan - {"patterns", "reconstruction", "codes"} - of_requests
 
 
