@@ -76,7 +76,7 @@ def clouds_of(folder: DataFolder, scan: Path, names: Iterable[str]) -> set[str]:
 def has_sources(folder: DataFolder, scan: Path, camera: str | None) -> bool:
     """True if the sources of a camera's cloud exist; None: those of a file of all cameras, except maps of causes."""
     further = f"{BUNDLE}/{DESCRIPTION}" if camera is None else causes_picture(camera)
-    sources = MESH, REPORT, further, f"{BUNDLE}/{CALIBRATION}"
+    sources = MESH, REPORT, further, _calibration_used(scan)
     return all(folder.owns(scan / source) for source in sources)
 
 

@@ -558,7 +558,7 @@ def measured(
     else:
         guess = guessed_rig(open_bundle(folder).outline, uncalibrated)
         walked = walk(None, axis=axis, devices=guess)
-        entered("calibrate by the scan itself", 0.58, "")
+        entered("calibrate by scan", 0.58, "")
         own = calibrated_by_scan(folder, guess, uncalibrated, {each.name: each.second for each in walked.seen})
         seen = [replace(each, device=own.calibration.cameras[each.name]) for each in walked.seen]
         walked = replace(walked, devices=own.calibration, seen=seen)
@@ -610,7 +610,8 @@ def refine_by_scans(prior: Calibration, bundles: Sequence[Path], entered: Entere
     for place, bundle in enumerate(bundles):
 
         def stage(name: str, fraction: float, detail: str, place: int = place) -> None:
-            entered(name, (place + fraction) / len(bundles), f"{place + 1} of {len(bundles)}, {detail}")
+            if name in _STAGES:
+                entered(name, (place + fraction) / len(bundles), f"{place + 1} of {len(bundles)}, {detail}")
 
         walked = _walked(
             bundle, None, None, entered=stage, axis=None, region=None, judged=None, drop_finest_bits=0, devices=prior

@@ -179,7 +179,7 @@ _CAUSES: Mapping[Refusal, tuple[tuple[int, int, int], str]] = {
 }
 
 
-def preview(mesh: Mesh, camera: Pinhole, white: Pixels, full_scale: int) -> Picture:
+def preview(mesh: Mesh, camera: Pinhole, white: Pixels, full_scale: int, *, unit: str = "mm") -> Picture:
     """Three panels: the white image, the mesh as the same camera sees it, and the mesh turned by 35°.
 
     From where the camera stands errors along its rays do not show; from the side they do, the more so the more
@@ -188,7 +188,7 @@ def preview(mesh: Mesh, camera: Pinhole, white: Pixels, full_scale: int) -> Pict
 
     Parameters
     ----------
-    white : (H, W) of `camera`, the white frame; `full_scale` is the value of a saturated sample.
+    white : (H, W) of `camera`, the white frame; `full_scale` is the value of a saturated sample; unit : of lengths.
     """
     scale = min(_PANEL_PX / camera.size.width_px, _PANEL_HEIGHT_PX / camera.size.height_px)
     size = Size(max(1, round(camera.size.width_px * scale)), max(1, round(camera.size.height_px * scale)))
@@ -202,10 +202,10 @@ def preview(mesh: Mesh, camera: Pinhole, white: Pixels, full_scale: int) -> Pict
     if len(mesh.faces):
         sample = _sampled(mesh, camera)
         middle = np.array([sample.percentiles(ordinates, (50.0,)) for ordinates in sample.points_mm]).ravel()
-        draw_scale(panels[1], size, at_panel.matrix[0, 0] / middle[2])
+        draw_scale(panels[1], size, at_panel.matrix[0, 0] / middle[2], unit=unit)
         aside = _turned_to_show(sample, middle, camera, size)
         panels.append(captioned(shaded(mesh, aside), f"turned by {_TURN_DEG:.0f} degrees", "backs are red"))
-        draw_scale(panels[2], size, aside.matrix[0, 0] / middle[2])
+        draw_scale(panels[2], size, aside.matrix[0, 0] / middle[2], unit=unit)
     return side_by_side(panels)
 
 
@@ -377,7 +377,7 @@ def captioned(panel: Picture, title: str, detail: str) -> Picture:
     return page
 
 
-def draw_scale(panel: Picture, size: Size, px_per_mm: float) -> None:
+def draw_scale(panel: Picture, size: Size, px_per_mm: float, *, unit: str = "mm") -> None:
     """A bar of 1, 2 or 5 times a power of ten mm, about a fifth of the panel wide, in the lower left corner."""
     if not 0 < px_per_mm < math.inf:
         return  # the middle of the object lies behind the camera: no length is right
@@ -388,7 +388,7 @@ def draw_scale(panel: Picture, size: Size, px_per_mm: float) -> None:
     cv2.line(panel, (16, row), (right, row), _INK, 2)
     for end in (16, right):
         cv2.line(panel, (end, row - 5), (end, row + 5), _INK, 2)
-    _text(panel, f"{length_mm:g} mm", (18, row - 10))
+    _text(panel, f"{length_mm:g} {unit}", (18, row - 10))
 
 
 def _draw_legend(page: Picture, left: int, counts: NDArray[np.int64]) -> None:

@@ -141,6 +141,7 @@ from slrig.scan.report import (
     with_seconds,
 )
 from slrig.scan.stream import CameraResult, LiveScan, marked, within
+from slrig.scan.uncalibrated import length_unit
 
 _PICTURE_PX = 480
 """Wide enough for a share, and a tenth of the work at full size."""
@@ -308,7 +309,7 @@ def reconstruct_into(
         # One at a time: each is as large as the mesh.
         place(MESH, encode_mesh_ply(mesh, sigma_calibration_mm=meshed.mesh_calibration_sigma_mm, axes=axes))
         # The mesh is what somebody waits for; what is left is shared by two threads.
-        pictures = beside.submit(_encoded_pictures, mesh, cameras)
+        pictures = beside.submit(_encoded_pictures, mesh, cameras, length_unit(plan.uncalibrated))
         place("mesh.glb", encode_mesh_glb(mesh))
         place(
             "points.ply",
@@ -491,10 +492,10 @@ def _used(faces: IntArray, count: int) -> NDArray[np.bool_]:
     return used
 
 
-def _encoded_pictures(mesh: Mesh, cameras: list[CameraResult]) -> dict[str, bytes]:
+def _encoded_pictures(mesh: Mesh, cameras: list[CameraResult], unit: str) -> dict[str, bytes]:
     """PNG of each picture by its name."""
     first = cameras[0]
-    encoded = {"preview.png": encode_png(preview(mesh, first.device, first.white, int(first.full_scale)))}
+    encoded = {"preview.png": encode_png(preview(mesh, first.device, first.white, int(first.full_scale), unit=unit))}
     for seen in cameras:
         if seen.second is not None and seen.second.residual_px is not None:
             residuals = agreement_picture(seen.second.residual_px, "projector px", seen.white, int(seen.full_scale))

@@ -86,7 +86,7 @@ def calibrated_by_scan(
     in_mm = known.baseline_mm is not None
     scale_sigma = known.baseline_sigma if in_mm else 0.0
     calibration = recorded(found, scale_sigma)
-    unit = "mm" if in_mm else "hundredths of the baseline"
+    unit = length_unit(known)
     focal = {name: float(change[0]) for name, change in found.changes.items()}
     report = {
         "shape_error": found.shape_error,
@@ -109,6 +109,11 @@ def calibrated_by_scan(
         f"({setting('baseline_mm')}) for millimetres. "
     )
     return ScanCalibration(calibration, report, (words + "Calibrate with a board for less",))
+
+
+def length_unit(guess: RigGuess | None) -> str:
+    """Unit of lengths of a scan, for pictures. guess : of a rig without a calibration."""
+    return "mm" if guess is None or guess.baseline_mm is not None else "% of baseline"
 
 
 def pairs_of_both_axes(folder: Path, seconds: Mapping[str, SecondAxisResult | None]) -> dict[str, PixelPairs]:

@@ -22,6 +22,7 @@ from slrig.scan.artefacts import decode_mesh_ply
 from slrig.scan.measured import refine_by_scans
 from slrig.scan.plan import ReconstructionPlan, RigGuess, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle
+from slrig.scan.uncalibrated import length_unit
 
 RIG = """
 name = "wide"
@@ -99,6 +100,7 @@ def test_a_first_scan_gives_a_shape_that_is_as_right_as_it_states(
     assert refined.solved is not None
     assert found.solved is not None
     assert any(line.startswith("shape") for line in lines)
+    assert (length_unit(None), length_unit(guess(baseline_mm=9)), length_unit(guess())) == ("mm", "mm", "% of baseline")
     assert np.trace(refined.solved.covariance) < np.trace(found.solved.covariance)
 
 
