@@ -61,8 +61,9 @@ function Result({scan, again, may}) {
 function Ended({scan, may}) {
   const titles = {failed: "The scan failed", cancelled: "The scan was stopped", interrupted: "The service ended while it scanned"};
   const [repeat, busy, problem] = useAction(async () => {
-    const {series, patterns: {codes, ...patterns}, ...plan} = scan.plan;
-    const made = await ask("POST", "/scan", {body: {...plan, patterns, label: scan.label, if_busy: "queue"}, headers: once()});
+    // Not to be asked for: the service fills it in from its hand-eye calibration.
+    const {series, patterns: {codes, ...patterns}, reconstruction: {rig_in_base, ...reconstruction}, ...plan} = scan.plan;
+    const made = await ask("POST", "/scan", {body: {...plan, patterns, reconstruction, label: scan.label, if_busy: "queue"}, headers: once()});
     sessionStorage.setItem("asked", made.id);
     location.hash = "#/scan";
   });
