@@ -390,7 +390,7 @@ def read_settings(path: Path | None = None, **given: object) -> ServiceSettings:
         data.update(given)
         return ServiceSettings(**data)
     except ValidationError as cause:
-        known = tuple(ServiceSettings.model_fields)
+        known = dict.fromkeys(ServiceSettings.model_fields, "")
         message = f"{source}: not valid settings of the service:\n{describe_errors(cause, data, known)}"
         raise ConfigError(message) from cause
 

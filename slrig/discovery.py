@@ -444,7 +444,7 @@ def _convert_driver_errors(label: str, options: Mapping[str, object], doing: str
     except SlrigError:
         raise
     except ValidationError as cause:
-        message = f"{label} refuses these options:\n{describe_errors(cause, options, ())}"
+        message = f"{label} refuses these options:\n{describe_errors(cause, options, {})}"
         raise ConfigError(message) from cause
     except BaseException as cause:
         if asks_to_end(cause):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 from collections.abc import Mapping, Sequence
 from http import HTTPStatus
+from types import MappingProxyType
 from typing import Any
 
 from fastapi import FastAPI, Request, Response
@@ -19,11 +19,12 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from slrig.api.scopes import needed_scope
-from slrig.bundle import model_keys
+from slrig.bundle import model_keys, proposal
 from slrig.errors import RigBusyError, SlrigError
 from slrig.failure import UNEXPECTED, JobFailure, errors_by_code
 from slrig.printable import printable
 
+_NOTHING: Mapping[str, str] = MappingProxyType({})
 MEDIA_TYPE = "application/problem+json"
 
 _CODES = {
@@ -191,7 +192,7 @@ async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
     if not isinstance(error, RequestValidationError):
         raise error
     faults = error.errors()
-    known: Sequence[str] = ()
+    known: Mapping[str, str] = {}
     body = getattr(request.scope.get("route"), "body_field", None)
     if body is not None and any(fault["type"] == "extra_forbidden" for fault in faults):
         known = model_keys(TypeAdapter(body.field_info.annotation))
@@ -224,24 +225,23 @@ async def _unexpected(_request: Request, error: Exception) -> JSONResponse:
     return answer(problem(500, UNEXPECTED, detail))
 
 
-def field_faults(found: Sequence[Any], known: Sequence[str] = ()) -> list[dict[str, Any]]:
+def field_faults(found: Sequence[Any], known: Mapping[str, str] = _NOTHING) -> list[dict[str, Any]]:
     """What pydantic found, as the `errors` of a problem. What was sent is shown only where it is short.
 
-    known : names of fields, of which the nearest is proposed for a misspelt one.
+    known : fields and their places, see `model_keys`, of which one is proposed for a misspelt or misplaced one.
     """
     return [_field_fault(entry, known) for entry in found]
 
 
-def _field_fault(entry: Any, known: Sequence[str]) -> dict[str, Any]:
+def _field_fault(entry: Any, known: Mapping[str, str]) -> dict[str, Any]:
     if entry["type"] == "json_invalid":
         message = f"is no JSON: {entry['ctx']['error']} at character {entry['loc'][-1]}"
         return {"field": "body", "message": message}
     place = [printable(str(part)) for part in entry["loc"] if part != "body"]
     sent = entry.get("input")
     message = printable(_MESSAGES.get(entry["type"], entry["msg"]))
-    near = difflib.get_close_matches(place[-1], known, n=1) if place and entry["type"] == "extra_forbidden" else []
-    if near:
-        message = f"There is no such field here; did you mean '{near[0]}'?"
+    if place and entry["type"] == "extra_forbidden" and (words := proposal(place[-1], known)) is not None:
+        message = f"There is no such field here; {words}"
     fault: dict[str, Any] = {"field": ".".join(place) or "body", "message": message}
     if isinstance(sent, str) and len(sent) <= 80:
         fault["found"] = printable(sent)

@@ -10,7 +10,7 @@ import difflib
 import json
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar
@@ -215,7 +215,7 @@ def read_json_model(
         raise error(f"{path} is not a valid {name}:\n{describe_errors(cause, data, model_keys(model))}") from cause
 
 
-def describe_errors(cause: ValidationError, data: object, known_keys: Sequence[str]) -> str:
+def describe_errors(cause: ValidationError, data: object, known_keys: Mapping[str, str]) -> str:
     """Return one line per fault. known_keys : keys to propose for a misspelt one."""
     lines = [f"  {_line(fault, data, known_keys)}" for fault in cause.errors(include_url=False)]
     if len(lines) > MAX_FAULTS:
@@ -223,30 +223,42 @@ def describe_errors(cause: ValidationError, data: object, known_keys: Sequence[s
     return "\n".join(lines)
 
 
-def model_keys(model: type[BaseModel] | TypeAdapter[Any]) -> tuple[str, ...]:
-    """Every key of a model and of the models in it, for proposals."""
+def model_keys(model: type[BaseModel] | TypeAdapter[Any]) -> Mapping[str, str]:
+    """Every key of a model and of the models in it, with the path of the first model that has it; for proposals."""
     schema = model.json_schema() if isinstance(model, TypeAdapter) else model.model_json_schema()
-    return tuple(dict.fromkeys(_properties(schema)))
+    found: dict[str, str] = {}
+    definitions = schema.get("$defs", {})
+    waiting: list[tuple[object, tuple[str, ...]]] = [(schema, ())]
+    seen = set()
+    for part, path in waiting:
+        if isinstance(part, list):
+            waiting += [(each, path) for each in part]
+        if not isinstance(part, Mapping):
+            continue
+        reference = part.get("$ref")
+        if reference is not None and reference not in seen:
+            seen.add(reference)
+            waiting.append((definitions[reference.rpartition("/")[2]], path))
+        properties = part.get("properties", {})
+        for name, each in properties.items():
+            found.setdefault(name, ".".join(path))
+            waiting.append((each, (*path, name)))
+        waiting += [(each, path) for name, each in part.items() if name not in ("$defs", "properties", "$ref")]
+    return found
 
 
-def _properties(schema: object) -> Iterator[str]:
-    if isinstance(schema, Mapping):
-        properties = schema.get("properties")
-        if isinstance(properties, Mapping):
-            yield from properties
-        for part in schema.values():
-            yield from _properties(part)
-    elif isinstance(schema, list):
-        for part in schema:
-            yield from _properties(part)
+def proposal(key: str, known: Mapping[str, str]) -> str | None:
+    """What to say of an unknown key: its place, or the nearest of the known ones; None where nothing is near."""
+    if key in known:
+        return f"it belongs into '{known[key]}'" if known[key] else "it belongs outside, into the whole"
+    near = difflib.get_close_matches(key, known, n=1)
+    return f"did you mean '{near[0]}'?" if near else None
 
 
-def _line(fault: ErrorDetails, data: object, known_keys: Sequence[str]) -> str:
+def _line(fault: ErrorDetails, data: object, known_keys: Mapping[str, str]) -> str:
     path = _path(fault["loc"], data, keep_last=fault["type"] == "missing")
     if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        near = difflib.get_close_matches(str(fault["loc"][-1]), known_keys, n=1)
-        remedy = f"did you mean '{near[0]}'?" if near else "remove it"
-        return f"{path}: unknown key; {remedy}"
+        return f"{path}: unknown key; {proposal(str(fault['loc'][-1]), known_keys) or 'remove it'}"
     if fault["type"] == "missing":
         return f"{path}: missing; add it"
     if fault["type"] == "value_error":

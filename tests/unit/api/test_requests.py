@@ -62,6 +62,7 @@ def planned(request: dict[str, Any], **defaults: Any) -> ScanPlan:
         ({"patterns": {"rows": 1}}, "patterns.rows", ""),
         ({"patterns": {"gray_cells": 4}}, "patterns.gray_cells", "did you mean 'gray_cell_px'?"),
         ({"labl": "a"}, "labl", "did you mean 'label'?"),
+        ({"gray_cell_px": 4}, "gray_cell_px", "it belongs into 'patterns'"),
         ({"qwxz": 1}, "qwxz", "no such field here; look at its spelling"),
         ({"reconstruction": {"max_code_gap": 0}}, "reconstruction.max_code_gap", ""),
         ({"reconstruction": {"keep_holes": "yes"}}, "reconstruction.keep_holes", ""),
