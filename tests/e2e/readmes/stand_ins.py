@@ -94,6 +94,18 @@ STAND_INS = (
         "grep -q avrdude arduino/Makefile",
         "needs an Arduino; tests/unit/drivers/serial_projector/test_arduino.py compiles it for one in a simulator",
     ),
+    StandIn(
+        "slrig calibrate hand-eye robot.csv poses --kind in-hand --calibration solved.json --board charuco "
+        "--corners 11x8 --square-mm 14 --output hand_eye.json",
+        None,
+        "needs a robot; tests/golden/test_hand_eye.py and tests/unit/test_cli_hand_eye.py give it rendered poses",
+    ),
+    StandIn(
+        "slrig calibrate hand-eye today.csv today --calibration solved.json --board charuco --corners 11x8 "
+        "--square-mm 14 --check hand_eye.json",
+        None,
+        "the same",
+    ),
     StandIn("pytest tests/bench/test_pipeline_speed.py -s", None, "measures speed: nothing else may run beside it"),
     StandIn("pytest tests/bench -s", None, "takes an hour, on a machine that does nothing else"),
 )
