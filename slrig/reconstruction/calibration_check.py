@@ -468,7 +468,7 @@ def _code_mistake(camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: 
     return f"{cause} (without it {left:.1%} of the points are more than {_REFUTED_PX:g} px off, with it {stated:.0%})"
 
 
-def _cells(pixels_px: FloatArray, size: Size, count: int) -> NDArray[np.intp]:
+def image_cells(pixels_px: FloatArray, size: Size, count: int) -> NDArray[np.intp]:
     """(n,) index of the cell of each pixel, of count x count over the image."""
     scale = count / np.array([size.width_px, size.height_px])
     column, row = np.clip((pixels_px + 0.5) * scale, 0, count - 1).astype(np.intp).T
@@ -480,7 +480,7 @@ def _systematic_px(camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> fl
     residual = epipolar_residual_px(camera, projector, pairs)
     limit = 5 * np.nanmedian(np.abs(residual))
     used = np.abs(residual) <= limit
-    cell, residual = _cells(pairs.camera_px[used], camera.size, _CELLS), residual[used]
+    cell, residual = image_cells(pairs.camera_px[used], camera.size, _CELLS), residual[used]
     count = np.bincount(cell, minlength=_CELLS**2)
     enough = count >= _MIN_CELL_POINTS
     if not enough.any():
@@ -569,10 +569,10 @@ def _covariance(
     its model says. The residuals after the first n are priors, each by itself.
     """
     count = len(pixels_px)
-    cell = _cells(pixels_px, size, _CELLS)
+    cell = image_cells(pixels_px, size, _CELLS)
     scores = [np.zeros((_CELLS**2, jacobian.shape[1])), np.zeros((_LENS_CELLS**2, jacobian.shape[1]))]
     np.add.at(scores[0], cell, jacobian[:count] * residual[:count, None])
-    np.add.at(scores[1], _cells(pixels_px, size, _LENS_CELLS), jacobian[:count] * floor)
+    np.add.at(scores[1], image_cells(pixels_px, size, _LENS_CELLS), jacobian[:count] * floor)
     scores.append(jacobian[count:] * residual[count:, None])
     score, inverse = np.concatenate(scores), linalg.pinv(jacobian.T @ jacobian)
     return np.asarray(inverse @ score.T @ score @ inverse)

@@ -24,12 +24,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from slrig.errors import SolveRefusedError
 from slrig.model import DEVICE_PARAMETERS, Calibration, FloatArray, Pinhole, Size
 from slrig.model.lens import distort, distortion_by_terms
-from slrig.reconstruction.calibration_check import PixelPairs, epipolar_residual_px, share_in_front
+from slrig.reconstruction.calibration_check import PixelPairs, epipolar_residual_px, image_cells, share_in_front
 from slrig.reconstruction.triangulation import pixel_rays
 
 MAX_SHAPE_ERROR = 0.0015
@@ -152,7 +151,7 @@ def self_calibrate(
         There are too few pairs, none of the starts brings points in front of both devices, or the pairs leave the shape
         open.
     """
-    problem = _Problem.of(prior, covariance, scans)
+    problem = without_poses = _Problem.of(prior, covariance, scans)
     start = np.zeros(problem.free)
     if baseline_mm is not None:
         problem, start = _from_nothing(problem, baseline_mm)
@@ -161,8 +160,8 @@ def self_calibrate(
         effect, start = problem.design_effect(solved), solved.z
         if baseline_mm is not None:
             # About the poses that were found, the length of the baseline is what was given.
-            own = _Problem.of(prior, covariance, scans)
-            problem, start = own.placed(problem.devices(start), start[: own.free], baseline_mm)
+            lenses = start[: without_poses.free]
+            problem, start = without_poses.placed(problem.devices(start), lenses, baseline_mm)
         solved = problem.solve(_POINTS, start, effect)
     devices = problem.devices(solved.z)
     share = problem.share_in_front(devices)
@@ -174,7 +173,7 @@ def self_calibrate(
         )
         raise SolveRefusedError(message)
     found = problem.result(prior, solved)
-    # A plane has two solutions, whatever the covariance of each.
+    # A plane has two solutions, and the covariance of one says nothing of the other.
     if found.shape_error <= most_error and not (baseline_mm is not None and problem.thickness(devices) < _FLAT):
         return found
     raise SolveRefusedError(_open_words(problem, devices, found, most_error))
@@ -364,14 +363,14 @@ class _Problem:
             residual = np.clip(residual, -4 * _scatter(residual), 4 * _scatter(residual))
             stated = float(np.median(_sigma_px(pairs)))
             for device, pixels in ((devices[index], pairs.camera_px), (devices[-1], pairs.projector_px)):
-                cell = _cells(pixels, device.size, _CELLS)
+                cell = image_cells(pixels, device.size, _CELLS)
                 counts = np.bincount(cell, minlength=_CELLS**2)
                 enough = counts >= _MIN_IN_CELL
                 means = np.bincount(cell, residual, _CELLS**2)[enough] / counts[enough]
                 square = float(np.mean(residual**2))
                 left = float(np.mean(means**2 - square / counts[enough])) if enough.any() else 0.0
                 floor = max(_LENS_FLOOR_PX / stated, _FLOOR_RATIO * np.sqrt(max(left, 0.0)))
-                parts = np.bincount(_cells(pixels, device.size, _LENS_CELLS))
+                parts = np.bincount(image_cells(pixels, device.size, _LENS_CELLS))
                 effects.append(1 + float(np.average(parts, weights=parts)) * floor**2 / square)
         return float(max(effects))
 
@@ -521,13 +520,6 @@ def _changed(device: Pinhole, change: FloatArray) -> Pinhole:
     matrix[:2, 2] += change[2:4]
     rotation = np.asarray(cv2.Rodrigues(change[9:12])[0]) @ device.rotation
     return Pinhole(device.size, matrix, device.distortion + change[4:9], rotation, device.translation_mm + change[12:])
-
-
-def _cells(pixels_px: FloatArray, size: Size, count: int) -> NDArray[np.intp]:
-    """(n,): cell of each pixel, of count x count over the image."""
-    scale = count / np.array([size.width_px, size.height_px])
-    column, row = np.clip((pixels_px + 0.5) * scale, 0, count - 1).astype(np.intp).T
-    return np.asarray(row * count + column)
 
 
 def triangulate(camera: Pinhole, projector: Pinhole, pairs: PixelPairs, /) -> FloatArray:
