@@ -7,9 +7,14 @@ import sys
 import numpy as np
 import pytest
 
+from slrig.calibration.board import BoardShape
+from slrig.calibration.solving.solve import solve
 from slrig.errors import SolveRefusedError
-from slrig.reconstruction import self_calibrate
-from slrig.reconstruction.self_calibration import MAX_SHAPE_ERROR
+from slrig.model import Axis, Calibration, FloatArray
+from slrig.reconstruction import DeviceGuess, PixelPairs, guessed_calibration, self_calibrate
+from slrig.reconstruction.self_calibration import MAX_SHAPE_ERROR, similarity_rms, triangulate
+from tests.unit.calibration.synthetic import Recipe, inside, made, seen
+from tests.unit.calibration.synthetic import rig as board_rig
 from tests.unit.reconstruction.test_self_calibration import (
     BASELINE_MM,
     KINDS,
@@ -74,3 +79,61 @@ def test_ten_scans_are_better_than_one() -> None:
     rms = np.sqrt(np.mean(np.square(errors), axis=0))
     sys.stdout.write("\nerror of shape by 1, 3 and 10 scans: " + ", ".join(f"{each:.3%}" for each in rms) + "\n")
     assert rms[2] < rms[1] < rms[0]
+
+
+def test_poses_of_a_board_and_scans_improve_a_calibration_by_a_scan() -> None:
+    """Shape errors of one scan, of few poses of a board with and without scans, and of a full calibration."""
+    errors = []
+    for seed in range(6):
+        chance = np.random.default_rng([seed, 9])
+        truth = board_rig(Recipe(lens_shift=seed % 2 == 0))
+        assert truth.projector is not None
+        guesses = [
+            DeviceGuess(each.size, float(each.matrix[0, 0] * (1 + 0.1 * chance.choice([-1, 1]))), 0.1)
+            for each in (truth.cameras["left"], truth.projector)
+        ]
+        surfaces = [at_the_board(kind, chance) for kind in KINDS * 2]
+        everywhere = np.concatenate(surfaces)
+        scans = [{"left": pairs_by(truth, points, chance)} for points in surfaces]
+        length = float(np.linalg.norm(truth.projector.centre_mm))
+        guess = guessed_calibration({"left": guesses[0]}, guesses[1])
+        alone = self_calibrate(*guess, scans[:1], baseline_mm=length, most_error=1.0)
+        found = [error_by(alone.calibration, truth, everywhere)]
+        for poses in (3, 15):
+            solution = solve(made(Recipe(seed=seed + 100, poses=poses), truth)[0], board_shape=BoardShape.FLAT)
+            found.append(error_by(solution.calibration, truth, everywhere))
+            for count in (1, 10):
+                refined = self_calibrate(solution.calibration, solution.covariance, scans[:count], most_error=np.inf)
+                found.append(error_by(refined.calibration, truth, everywhere))
+        errors.append(found)
+    rms = np.sqrt(np.mean(np.square(errors), axis=0))
+    words = ("1 scan", "3 poses", "and 1 scan", "and 10", "15 poses", "and 1 scan", "and 10")
+    figures = ", ".join(f"{word} {each:.4%}" for word, each in zip(words, rms, strict=True))
+    sys.stdout.write(f"\nerror of shape: {figures}; 3 poses and 10 scans over 15 poses: {rms[3] / rms[4]:.2f}\n")
+    assert rms[1] < rms[0] / 10
+    assert rms[2] < 1.05 * rms[1]
+    assert rms[3] < 1.05 * rms[1]
+
+
+def at_the_board(kind: str, chance: np.random.Generator) -> FloatArray:
+    """Points of a scene where the board is shown, mm."""
+    return surface(kind, chance, 8_000) + chance.normal((0, 0, -110), (15, 15, 20))
+
+
+def pairs_by(truth: Calibration, points_mm: FloatArray, chance: np.random.Generator | None) -> PixelPairs:
+    """The pixels that the camera and the projector share; with noise unless chance is None."""
+    assert truth.projector is not None
+    here, there = seen(truth.cameras["left"], points_mm), seen(truth.projector, points_mm)
+    both = inside(here, truth.cameras["left"].size) & inside(there, truth.projector.size)
+    noise = 0.0 if chance is None else chance.normal(0, 0.05, there[both].shape)
+    return PixelPairs(here[both], there[both] + noise, np.full(int(both.sum()), 0.05), Axis.COLUMN)
+
+
+def error_by(found: Calibration, truth: Calibration, points_mm: FloatArray) -> float:
+    """Rms error of the points' shape over their extent, noise aside."""
+    assert found.projector is not None
+    assert truth.projector is not None
+    pairs = pairs_by(truth, points_mm, None)
+    true = triangulate(truth.cameras["left"], truth.projector, pairs)
+    also = triangulate(found.cameras["left"], found.projector, pairs)
+    return similarity_rms(true, also) / float(np.linalg.norm(np.ptp(true, axis=0)))
