@@ -5,15 +5,15 @@ on the epipolar line of the camera pixel. One scan by columns and rows has 10^5 
 pose but for the length of the baseline, and, with what is known beforehand of focal lengths and principal points, the
 lenses (Hartley and Zisserman, Multiple View Geometry, 2004, chapters 9 and 19).
 
-`self_calibrate` minimises Σ ρ((r / σ)²) + zᵀ z: r the distance from the epipolar line, projector pixels; ρ(x) =
+`self_calibrate` minimises Σ ρ((r / σ)²) / e + zᵀ z: r the distance from the epipolar line, projector pixels; ρ(x) =
 2 √(1 + x) − 2; z the change of all parameters in standard deviations of what was known before (a prior of mean 0 and
 covariance L Lᵀ, change = L z). Parameters without prior variance stay. The same function therefore starts from rough
 guesses of a new rig, and improves a calibration that a board gave.
 
-Residuals of neighbours are alike, because no lens is exactly what its model says. σ² therefore contains the design
-effect, and the covariance is (1 + Jᵀ W J)⁻¹ with it. What that means is the error of shape: the rms by which points
-move when the parameters are drawn from it, after the best similarity, over the size of the scene. Views from one place
-and focal lengths that are hardly known leave a large one, and are refused by it. A flat scene has two solutions
+Residuals of neighbours are alike, because no lens is exactly what its model says. e is the design effect of that, and
+the covariance is (1 + Jᵀ W J)⁻¹ with it. It determines the error of shape: the rms by which points move when the
+parameters are drawn from it, after the best similarity, over the size of the scene. Views from one place and focal
+lengths that are hardly known lead to a large one, and are refused by it. A flat scene has two solutions
 (Longuet-Higgins 1986), and is refused as such.
 """
 
@@ -111,7 +111,8 @@ class SelfCalibration:
     size, one standard deviation. size_mm : diagonal of the box around the scene. volume_mm : (2, 3) float64, that box.
     error_mm : shape_error as a length. pairs : number used. residual_px : robust standard deviation of the distances
     from epipolar lines. changes : of each device, relative change of the focal length and shift of the principal point
-    in px, (3,) float64. moved_sigma : rms change of the parameters in standard deviations of what was known before.
+    in px, (3,) float64. contradiction : robust standard deviation of the distances from the epipolar lines of before,
+    over what the prior covariance and the noise explain: about 1 where these hold.
     """
 
     calibration: Calibration
@@ -122,7 +123,7 @@ class SelfCalibration:
     pairs: int
     residual_px: float
     changes: Mapping[str, FloatArray]
-    moved_sigma: float
+    contradiction: float
 
     @property
     def error_mm(self) -> float:
@@ -156,13 +157,13 @@ def self_calibrate(
     if baseline_mm is not None:
         problem, start = _from_nothing(problem, baseline_mm)
     solved = problem.solve(_POINTS, start, _USUAL_EFFECT)
-    for _ in range(2):
-        effect, start = problem.design_effect(solved), solved.z
-        if baseline_mm is not None:
-            # About the poses that were found, the length of the baseline is what was given.
-            lenses = start[: without_poses.free]
-            problem, start = without_poses.placed(problem.devices(start), lenses, baseline_mm)
-        solved = problem.solve(_POINTS, start, effect)
+    # Once: a large effect lets the prior draw the solution off, and what that leaves would make it larger still.
+    effect, contradiction, start = problem.design_effect(solved), problem.contradiction(solved), solved.z
+    if baseline_mm is not None:
+        # About the poses that were found, the length of the baseline is what was given.
+        lenses = start[: without_poses.free]
+        problem, start = without_poses.placed(problem.devices(start), lenses, baseline_mm)
+    solved = problem.solve(_POINTS, start, effect)
     devices = problem.devices(solved.z)
     share = problem.share_in_front(devices)
     if share < _MIN_IN_FRONT:
@@ -172,7 +173,7 @@ def self_calibrate(
             "far from its guess"
         )
         raise SolveRefusedError(message)
-    found = problem.result(prior, solved)
+    found = problem.result(prior, solved, contradiction)
     # A plane has two solutions, and the covariance of one says nothing of the other.
     if found.shape_error <= most_error and not (baseline_mm is not None and problem.thickness(devices) < _FLAT):
         return found
@@ -181,13 +182,14 @@ def self_calibrate(
 
 @dataclass(frozen=True, slots=True)
 class _Solved:
-    """z : (p,) float64, the change in standard deviations of the prior; cost : Σ ρ + zᵀ z; sigma : scale of the
-    residuals; blocks : the pairs that were used.
+    """z : (p,) float64, the change in standard deviations of the prior; cost : Σ ρ / effect + zᵀ z; sigma : scale of
+    the residuals; effect : design effect; blocks : the pairs that were used.
     """
 
     z: FloatArray
     cost: float
     sigma: float
+    effect: float
     blocks: list[tuple[int, PixelPairs]]
 
 
@@ -261,8 +263,8 @@ class _Problem:
         return [(index, pairs.thinned(each)) for index, pairs in self.blocks]
 
     def solve(self, count: int, start: FloatArray, design_effect: float) -> _Solved:
-        """Levenberg–Marquardt with weights of soft L1; the scale of the residuals is that of their median, times the
-        root of the design effect.
+        """Levenberg–Marquardt with weights of soft L1 over the design effect; the scale of the residuals is that of
+        their median.
 
         A principal point and a turn explain each other along a curved valley, so each step is bent by the second
         derivative (geodesic acceleration: Transtrum and Sethna 2012).
@@ -275,11 +277,11 @@ class _Problem:
             if step % _STEPS_PER_SIGMA == 0:
                 residuals = np.concatenate([_residuals(devices, index, pairs) for index, pairs in blocks])
                 before = sigma
-                sigma = min(sigma, float(np.clip(np.sqrt(design_effect) * _scatter(residuals), 0.02, _MOST_SIGMA)))
+                sigma = min(sigma, float(np.clip(_scatter(residuals), 0.02, _MOST_SIGMA)))
                 quiet = quiet if sigma > _SAME_SIGMA * before else 0
-                cost = self._cost(z, blocks, sigma)
+                cost = self._cost(z, blocks, sigma, design_effect)
             parts = [(*self._slopes(z, index, pairs), index, pairs) for index, pairs in blocks]
-            weights = [_weights(residual / sigma) / sigma**2 for residual, *_ in parts]
+            weights = [_weights(residual / sigma) / sigma**2 / design_effect for residual, *_ in parts]
             matrix, gradient = np.eye(self.free), z.copy()
             for (residual, slopes, *_), weight in zip(parts, weights, strict=True):
                 matrix += slopes.T @ (slopes * weight[:, None])
@@ -295,7 +297,7 @@ class _Problem:
                     bend += slopes.T @ (weight * np.clip(2 / _PROBE * (along - slopes @ change), -1e6, 1e6))
                 second = -0.5 * np.linalg.solve(damped, bend)
                 if 2 * np.linalg.norm(second) <= _MOST_BEND * np.linalg.norm(change):
-                    tried = self._cost(z + change + second, blocks, sigma)
+                    tried = self._cost(z + change + second, blocks, sigma, design_effect)
                     if tried < cost:
                         break
                 damping *= 4
@@ -305,13 +307,14 @@ class _Problem:
             quiet = quiet + 1 if gain < _LEAST_GAIN else 0
             if quiet > _STEPS_PER_SIGMA:
                 break
-        return _Solved(z, cost, sigma, blocks)
+        return _Solved(z, cost, sigma, design_effect, blocks)
 
-    def _cost(self, z: FloatArray, blocks: list[tuple[int, PixelPairs]], sigma: float) -> float:
-        """Σ ρ + zᵀ z."""
+    def _cost(self, z: FloatArray, blocks: list[tuple[int, PixelPairs]], sigma: float, effect: float) -> float:
+        """Σ ρ / effect + zᵀ z."""
         devices = self.devices(z)
         squares = [(_residuals(devices, index, pairs) / sigma / _LOSS_SCALE) ** 2 for index, pairs in blocks]
-        return 2 * _LOSS_SCALE**2 * float(np.sum(np.sqrt(1 + np.concatenate(squares)) - 1)) + float(z @ z)
+        loss = 2 * _LOSS_SCALE**2 * float(np.sum(np.sqrt(1 + np.concatenate(squares)) - 1))
+        return loss / effect + float(z @ z)
 
     def _slopes(self, z: FloatArray, index: int, pairs: PixelPairs) -> tuple[FloatArray, FloatArray]:
         """Residuals (n,), in their stated deviations, and their derivatives by z, (n, p)."""
@@ -379,9 +382,19 @@ class _Problem:
         matrix = np.eye(self.free)
         for index, pairs in solved.blocks:
             residual, slopes = self._slopes(solved.z, index, pairs)
-            weight = _weights(residual / solved.sigma) / solved.sigma**2
+            weight = _weights(residual / solved.sigma) / solved.sigma**2 / solved.effect
             matrix += slopes.T @ (slopes * weight[:, None])
         return np.asarray(np.linalg.inv(matrix))
+
+    def contradiction(self, solved: _Solved) -> float:
+        """Scatter of the residuals without a change, over what the prior and the residuals of the fit explain."""
+        devices, unchanged = self.devices(solved.z), np.zeros(self.free)
+        left = _scatter(np.concatenate([_residuals(devices, index, pairs) for index, pairs in solved.blocks]))
+        ratios = []
+        for index, pairs in solved.blocks:
+            residual, slopes = self._slopes(unchanged, index, pairs)
+            ratios.append(residual / np.sqrt(left**2 + (slopes**2).sum(axis=1)))
+        return _scatter(np.concatenate(ratios))
 
     def thickness(self, devices: Sequence[Pinhole]) -> float:
         """Least extent of the scene over its largest."""
@@ -393,7 +406,7 @@ class _Problem:
     def points(self, devices: Sequence[Pinhole], pairs: Sequence[tuple[int, PixelPairs]]) -> FloatArray:
         return np.concatenate([triangulate(devices[index], devices[-1], each) for index, each in pairs])
 
-    def result(self, prior: Calibration, solved: _Solved) -> SelfCalibration:
+    def result(self, prior: Calibration, solved: _Solved, contradiction: float) -> SelfCalibration:
         names, devices = [*prior.cameras, "projector"], self.devices(solved.z)
         covariance = self.covariance(solved)
         sample = self.thinned(_SHAPE_POINTS * len(self.blocks))
@@ -427,7 +440,7 @@ class _Problem:
             sum(len(each) for _, each in solved.blocks),
             _scatter(np.concatenate(residuals)),
             changes,
-            float(np.sqrt(np.mean(solved.z**2))),
+            contradiction,
         )
 
 

@@ -19,7 +19,7 @@ from slrig.scan.stream import SecondAxisResult
 UNITS_PER_BASELINE = 100.0
 """Length of the baseline where nothing is known of it, in the unit of the results."""
 
-_DRIFTED = 3.0  # rms change of the parameters in their deviations from before
+_CONTRADICTED = 3.0  # distances from the epipolar lines of before, over their stated deviations
 
 _USUAL_RATIO, _USUAL_SIGMA = 1.4, 0.25
 """Focal length over the width of the image, and its relative deviation, where nothing is known."""
@@ -142,11 +142,11 @@ def refined_by_pairs(prior: Calibration, scans: Sequence[Mapping[str, PixelPairs
     for name in names:
         focal, x, y = found.changes[name]
         lines.append(f"{device_title(name)}: focal length {focal:+.2%}, principal point {x:+.2f}, {y:+.2f} px")
-    if found.moved_sigma > _DRIFTED:
+    if found.contradiction > _CONTRADICTED:
         lines.append(
-            f"drift     the scans contradict the calibration: its parameters had to change by {found.moved_sigma:.1f} "
-            "of their own deviations. A device was moved, refocused or zoomed since, or the calibration understates "
-            "its error: verify it with the board (slrig verify)"
+            f"drift     the scans contradict the calibration: their pixels are {found.contradiction:.1f} times as far "
+            "from its epipolar lines as it states. A device was moved, refocused or zoomed since, or the calibration "
+            "understates its error: verify it with the board (slrig verify)"
         )
     # The covariance holds the scale already, which pairs do not touch.
     refined = recorded(found, 0.0)
