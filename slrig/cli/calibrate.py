@@ -361,8 +361,8 @@ def refine(
 ) -> None:
     """Improve a calibration by ordinary scans.
 
-    Says when they contradict it. Scans that the calibration was made of must not be among them. Import the result, and
-    activate it.
+    Refused where they contradict it, as after a device was moved. Scans that the calibration was made of must not be
+    among them. Import the result, and activate it.
     """
     from slrig.bundle import read_calibration, write_calibration
     from slrig.cli.display import progress_shown

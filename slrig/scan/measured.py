@@ -50,6 +50,7 @@ from slrig.reconstruction import (
     CalibrationCheck,
     CameraCurves,
     MergedCurves,
+    PixelPairs,
     SheetCurves,
     SinusoidResponse,
     calibration_modes,
@@ -598,7 +599,7 @@ def refine_by_scans(prior: Calibration, bundles: Sequence[Path], entered: Entere
     BundleError, CalibrationError, PatternError
         A bundle cannot be used, or is of other devices; or the calibration does not state its errors.
     SolveRefusedError
-        A bundle has one axis, or the scans leave the shape open.
+        A bundle has one axis, the scans leave the shape open, or they contradict the calibration.
     """
     if prior.solved is None:
         message = (
@@ -606,6 +607,14 @@ def refine_by_scans(prior: Calibration, bundles: Sequence[Path], entered: Entere
             f"solve it from board poses, or take that of a scan with {setting('uncalibrated')}"
         )
         raise CalibrationError(message)
+    return refined_by_pairs(prior, pairs_of_scans(prior, bundles, entered))
+
+
+def pairs_of_scans(devices: Calibration, bundles: Sequence[Path], entered: Entered) -> list[dict[str, PixelPairs]]:
+    """Pixels that each camera shares with the projector, of each scan by columns and rows.
+
+    Raises BundleError, CalibrationError, PatternError; SolveRefusedError: a bundle has one axis.
+    """
     scans = []
     for place, bundle in enumerate(bundles):
 
@@ -614,10 +623,10 @@ def refine_by_scans(prior: Calibration, bundles: Sequence[Path], entered: Entere
                 entered(name, (place + fraction) / len(bundles), f"{place + 1} of {len(bundles)}, {detail}")
 
         walked = _walked(
-            bundle, None, None, entered=stage, axis=None, region=None, judged=None, drop_finest_bits=0, devices=prior
+            bundle, None, None, entered=stage, axis=None, region=None, judged=None, drop_finest_bits=0, devices=devices
         )
         scans.append(pairs_of_both_axes(bundle, {each.name: each.second for each in walked.seen}))
-    return refined_by_pairs(prior, scans)
+    return scans
 
 
 def _tried(

@@ -129,10 +129,18 @@ def pairs_of_both_axes(folder: Path, seconds: Mapping[str, SecondAxisResult | No
 
 
 def refined_by_pairs(prior: Calibration, scans: Sequence[Mapping[str, PixelPairs]]) -> tuple[Calibration, list[str]]:
-    """A calibration improved by the pairs of scans, and what changed, a line each. Raises SolveRefusedError: see
-    `self_calibrate`.
+    """A calibration improved by the pairs of scans, and its changes, a line each.
+
+    Raises SolveRefusedError: the scans contradict the calibration, or see `self_calibrate`.
     """
     found = self_calibrate(prior, device_covariance(prior), scans, most_error=np.inf)
+    if found.contradiction > _CONTRADICTED:
+        message = (
+            f"the scans contradict the calibration: their pixels are {found.contradiction:.1f} times as far from its "
+            "epipolar lines as it states. Most likely a device was moved, refocused or zoomed since, so that there is "
+            "nothing to improve: calibrate again (slrig verify with the board says how large the drift is)"
+        )
+        raise SolveRefusedError(message)
     names = [*prior.cameras, "projector"]
     scale_sigma = 0.0 if prior.solved is None else prior.solved.scale_sigma
     lines = [
@@ -142,12 +150,6 @@ def refined_by_pairs(prior: Calibration, scans: Sequence[Mapping[str, PixelPairs
     for name in names:
         focal, x, y = found.changes[name]
         lines.append(f"{device_title(name)}: focal length {focal:+.2%}, principal point {x:+.2f}, {y:+.2f} px")
-    if found.contradiction > _CONTRADICTED:
-        lines.append(
-            f"drift     the scans contradict the calibration: their pixels are {found.contradiction:.1f} times as far "
-            "from its epipolar lines as it states. A device was moved, refocused or zoomed since, or the calibration "
-            "understates its error: verify it with the board (slrig verify)"
-        )
     # The covariance holds the scale already, which pairs do not touch.
     refined = recorded(found, 0.0)
     if refined.solved is not None:

@@ -6,6 +6,8 @@ principal row with its deviation. Four poses, Gray code only, by somebody else (
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -21,7 +23,11 @@ from slrig.calibrate.store import CalibrationResult, ReadPose, solve_poses
 from slrig.calibration.board import COLUMN, ROW, Board, BoardKind, Correspondences
 from slrig.calibration.solution import PARAMETERS, PROJECTOR
 from slrig.cli.commands import app
+from slrig.errors import SolveRefusedError
 from slrig.model import FloatArray
+from slrig.reconstruction import PixelPairs
+from slrig.scan.measured import pairs_of_scans
+from slrig.scan.uncalibrated import refined_by_pairs
 from tests.golden.test_bundles import reconstructed
 
 pytestmark = [pytest.mark.shared, pytest.mark.slow]
@@ -113,6 +119,25 @@ def test_the_projectors_lens_is_shifted_and_its_row_is_known_so_well(result: Cal
     assert abs(projector.matrix[0, 0] - 1890) < 30
     assert abs(result.calibration.cameras["cam0"].matrix[0, 0] - 3450) < 60
     assert result.calibration.solved is not None
+
+
+@pytest.fixture(scope="module")
+def pairs(shared: Path, result: CalibrationResult) -> list[dict[str, PixelPairs]]:
+    """Columns and rows of the four captures as scans."""
+    folders = [shared / "captures" / "boards" / name for name in POSES]
+    return pairs_of_scans(result.calibration, folders, lambda *_: None)
+
+
+@pytest.mark.parametrize(("turned_deg", "holds"), [(0.0, True), (0.1, False)])
+def test_scans_of_the_real_boards_contradict_a_projector_that_was_turned(
+    result: CalibrationResult, pairs: list[dict[str, PixelPairs]], turned_deg: float, holds: bool
+) -> None:
+    projector = result.calibration.projector
+    assert projector is not None
+    turn = cv2.Rodrigues(np.deg2rad([turned_deg, 0.0, 0.0]))[0]
+    before = replace(result.calibration, projector=replace(projector, rotation=turn @ projector.rotation))
+    with nullcontext() if holds else pytest.raises(SolveRefusedError, match="scans contradict the calibration"):
+        refined_by_pairs(before, pairs)
 
 
 def test_a_pose_that_nobody_touched_is_not_stale(shared: Path, tmp_path: Path, result: CalibrationResult) -> None:
