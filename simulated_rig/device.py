@@ -308,7 +308,7 @@ class SimulatedHead:
             or known.surface.vertices_mm is not shape.vertices_mm
             or any(known.cameras[name] is not camera for name, camera in cameras.items())
         ):
-            known = self._truth = Truth(Surface(shape.vertices_mm, shape.faces), cameras)
+            known = self._truth = Truth(Surface(shape.vertices_mm, shape.faces), cameras, self._calibration)
         return known
 
 

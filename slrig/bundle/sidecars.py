@@ -1,8 +1,8 @@
 """Further files of a bundle: truth of a rendered scene, health, notes, refused frames, turntable angle.
 
 `truth.ply` is the surface (binary little endian), `visible_points.npy` its points that the first camera sees lit by the
-projector, `truth-CAMERA.npz` the maps of each camera. Maps and surface are float32 on disk: at a distance of one metre
-that is 0.06 micrometres, far below any measurement.
+projector, `truth-CAMERA.npz` the maps of each camera, `truth-calibration.json` the true calibration. Maps and surface
+are float32 on disk: at a distance of one metre that is 0.06 micrometres, far below any measurement.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,11 +18,12 @@ import numpy as np
 from pydantic import Field
 
 from slrig.bundle.arrays import read_arrays
+from slrig.bundle.calibration import read_calibration, write_calibration
 from slrig.bundle.description import CameraName
 from slrig.bundle.storage import json_bytes, write_file
 from slrig.bundle.validation import Strict, read_json, read_json_model, read_text
-from slrig.errors import BundleError
-from slrig.model import CameraTruth, FloatArray, Shot, Surface, Truth
+from slrig.errors import BundleError, CalibrationError
+from slrig.model import Calibration, CameraTruth, FloatArray, Shot, Surface, Truth
 
 _MAX_TRUTH_BYTES = 2**30
 
@@ -42,6 +43,7 @@ TURNTABLE_MAX_BYTES = 2**16
 SURFACE_FILE = "truth.ply"
 VISIBLE_POINTS_FILE = "visible_points.npy"
 TRUTH_MAPS_FILE = "truth-{camera}.npz"
+TRUE_CALIBRATION_FILE = "truth-calibration.json"
 _SURFACE_HEAD = """ply
 format binary_little_endian 1.0
 element vertex {vertices}
@@ -191,11 +193,29 @@ class BundleTruth:
     """Truth of a bundle. cameras : empty in bundles of other renderers, which have no maps.
 
     visible_points_mm : (n, 3) float64, world: surface points seen by the first camera and lit by the projector.
+    calibration : the true one; None in bundles of other renderers, whose truth is in the world of the bundle's own.
     """
 
     surface: Surface
     visible_points_mm: FloatArray
     cameras: Mapping[str, CameraTruth]
+    calibration: Calibration | None
+
+    def in_world_of(self, calibration: Calibration) -> tuple[Surface, FloatArray]:
+        """Surface and visible points in the world of another calibration of the rig: where its first camera is, the
+        true one is. Nothing is fitted, so that every other error of the calibration stays one.
+        """
+        true_cameras = {} if self.calibration is None else self.calibration.cameras
+        name = next((each for each in calibration.cameras if each in true_cameras), None)
+        if name is None:
+            return self.surface, self.visible_points_mm
+        true, found = true_cameras[name], calibration.cameras[name]
+        turn = found.rotation.T @ true.rotation
+        shift_mm = found.rotation.T @ (true.translation_mm - found.translation_mm)
+        vertices_mm, visible_mm = (
+            each @ turn.T + shift_mm for each in (self.surface.vertices_mm, self.visible_points_mm)
+        )
+        return replace(self.surface, vertices_mm=vertices_mm), visible_mm
 
 
 def write_truth(folder: Path, truth: Truth) -> None:
@@ -214,6 +234,8 @@ def write_truth(folder: Path, truth: Truth) -> None:
             visible_points_mm=camera.visible_points_mm,
         )
         write_file(folder / TRUTH_MAPS_FILE.format(camera=name), data.getvalue())
+    if truth.calibration is not None:
+        write_calibration(folder / TRUE_CALIBRATION_FILE, truth.calibration)
 
 
 def read_truth(folder: Path) -> BundleTruth | None:
@@ -235,10 +257,12 @@ def read_truth(folder: Path) -> BundleTruth | None:
                 np.asarray(maps["projector_px"], dtype=np.float64),
                 _points(maps["visible_points_mm"]),
             )
-    except (OSError, ValueError, LookupError, TypeError, AttributeError) as cause:
+        path = folder / TRUE_CALIBRATION_FILE
+        calibration = read_calibration(path) if path.exists() else None
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, CalibrationError) as cause:
         message = f"{path}: expected truth of the bundle, found: {cause}; render the scene again"
         raise BundleError(message) from cause
-    return BundleTruth(surface, visible, cameras)
+    return BundleTruth(surface, visible, cameras, calibration)
 
 
 def _surface_bytes(surface: Surface) -> bytes:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model.geometry import FloatArray, IntArray, require_array
+from slrig.model.geometry import Calibration, FloatArray, IntArray, require_array
 
 _FULL_SCALE_16 = 65_535
 # The sRGB transfer function of IEC 61966-2-1: linear up to the first number, then a power law.
@@ -94,10 +94,13 @@ class CameraTruth:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """Ground truth of a rendered scene, in the calibration's world frame."""
+    """Ground truth of a rendered scene, in the renderer's world frame. calibration : the true one, in the same frame;
+    None if the truth is in the frame of every calibration of the rig.
+    """
 
     surface: Surface
     cameras: Mapping[str, CameraTruth]
+    calibration: Calibration | None = None
 
 
 class Refusal(IntEnum):

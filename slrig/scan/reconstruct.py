@@ -322,9 +322,9 @@ def reconstruct_into(
         entered("pictures", 0.85, "")
         for name, picture in pictures.result().items():
             place(name, picture)
-        # The truth is in the world of the rig's own calibration.
+        # Without a calibration nothing is known of the scale.
         is_own = plan.uncalibrated is not None
-        known = {} if is_own else _compared_with_truth(bundle, mesh, cameras, plan.region, entered)
+        known = {} if is_own else _compared_with_truth(bundle, mesh, cameras, walked.devices, plan.region, entered)
         if (turntable := read_turntable_angle(bundle)) is not None:
             known["turntable"] = turntable.document()
         entered("write report", 0.98, "")
@@ -510,6 +510,7 @@ def _compared_with_truth(
     bundle: Path,
     mesh: Mesh,
     cameras: list[CameraResult],
+    calibration: Calibration,
     region: Region | None,
     entered: Callable[[str, float, str], None],
 ) -> dict[str, Mapping[str, object]]:
@@ -518,12 +519,12 @@ def _compared_with_truth(
     if truth is None:
         return {}
     entered("compare with truth", 0.9, "")
-    seen, visible = cameras[0], truth.visible_points_mm
+    seen, (surface, visible) = cameras[0], truth.in_world_of(calibration)
     if region is not None:
         # What nobody asked for is not missing.
         pixels = np.clip(project(seen.device, visible), 0, np.array(seen.curves.refusal.shape[::-1]) - 1)
         visible = visible[within(region, visible, pixels, seen.curves.refusal, seen.device)]
-    return {"truth": score(mesh, truth.surface, visible, *(each.device.centre_mm for each in cameras)).as_dict()}
+    return {"truth": score(mesh, surface, visible, *(each.device.centre_mm for each in cameras)).as_dict()}
 
 
 _FEW, _MANY = 0.05, 0.25

@@ -173,6 +173,7 @@ def test_a_rig_is_calibrated_over_http_and_scans_with_it_after_a_kill(start: Sta
         with service.client() as client:
             scan = scanned(client)
         assert scan["state"] == "succeeded", scan["error"]
+        assert scan["summary"]["truth"]["gross_fraction"] < 0.001
     assert service.stop() == 0
 
 

@@ -186,7 +186,8 @@ def _truth() -> Truth:
     other = CameraTruth(depth_mm + 1, rng.uniform(0, 30, (*CAMERA.shape, 2)), rng.normal(size=(20, 3)))
     # Two triangles that share no vertex, though two of their corners coincide: they must stay apart.
     vertices_mm = np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 0], [0, 10, 0], [-10, 0, 1.0]])
-    return Truth(Surface(vertices_mm, np.array([[0, 1, 2], [3, 4, 5]], np.int32)), {"b": camera, "a": other})
+    surface = Surface(vertices_mm, np.array([[0, 1, 2], [3, 4, 5]], np.int32))
+    return Truth(surface, {"b": camera, "a": other}, sample_calibration())
 
 
 def test_truth_comes_back(tmp_path: Path) -> None:
@@ -209,7 +210,7 @@ def test_a_bundle_may_have_no_truth(tmp_path: Path) -> None:
     assert read_truth(tmp_path) is None
 
 
-@pytest.mark.parametrize("name", ["truth.ply", "visible_points.npy", "truth-a.npz"])
+@pytest.mark.parametrize("name", ["truth.ply", "visible_points.npy", "truth-a.npz", "truth-calibration.json"])
 @pytest.mark.parametrize("kept", [0.0, 0.5])
 def test_cut_truth_is_refused(tmp_path: Path, name: str, kept: float) -> None:
     write_truth(tmp_path, _truth())

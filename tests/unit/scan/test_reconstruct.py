@@ -316,6 +316,27 @@ def test_some_of_the_line_shifts_make_a_coarser_mesh(
     assert truth["complete_0.3mm"] > 0.90
 
 
+def test_truth_is_compared_in_the_world_of_the_calibration_in_use(
+    tmp_path_factory: pytest.TempPathFactory, tmp_path: Path
+) -> None:
+    bundle = prepared_bundle(tmp_path_factory, "ball with its truth")
+    true = read_calibration(bundle / "calibration.json")
+    assert true.projector is not None
+    eye = true.cameras["left"]
+    # As a rig calibrates itself: the world is its first camera.
+    lamp = replace(
+        true.projector,
+        rotation=true.projector.rotation @ eye.rotation.T,
+        translation_mm=true.projector.rotation @ eye.centre_mm + true.projector.translation_mm,
+    )
+    own = Calibration({"left": replace(eye, rotation=np.eye(3), translation_mm=np.zeros(3))}, lamp)
+    write_calibration(tmp_path / "own.json", own)
+    found = run(bundle, tmp_path / "out", calibration=tmp_path / "own.json")["truth"]
+    assert found["gross_fraction"] == 0
+    assert found["rms_mm"] < 0.05
+    assert found["complete_0.3mm"] > 0.9
+
+
 def seen_live(bundle: Path, *, upside_down: bool = False, last_exposure_s: float | None = None) -> LiveScan:
     """What a reconstruction holds that was fed while this bundle was captured."""
     recorded = read_bundle(bundle)
