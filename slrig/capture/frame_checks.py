@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import Black, Gray, Integers, LineShift, Pattern, Primary, Sine, White, gray_index, to_gray
+from slrig.model import Black, Gray, Integers, LineShift, Pattern, Primary, Sine, Size, White, gray_index, to_gray
 
 Samples = NDArray[np.float32]
 SampleMask = NDArray[np.bool_]
@@ -37,6 +37,8 @@ CHECK_CABLE = "check the cable"
 """Words of all faults that chance causes."""
 
 _MIN_LIT_SAMPLES = 40
+_OVEREXPOSED = 0.5
+"""Of the lit samples, saturated in white. Most of the others lie at edges, or noise hides that they are clipped."""
 
 _MAX_CHANGE, _MAX_CHANGED_FRACTION = 0.1, 0.01  # of the range of a frame; of the pixels
 
@@ -83,6 +85,7 @@ _MIN_WAVE_SIGMAS = 5.0
 _MIN_WAVE = 0.03  # relative to white − black, for each line; sharp lines have 0.32
 _MIN_LINE_LIGHT = 0.1  # relative to the 99th percentile
 _REFERENCE_LEVEL_TOLERANCE, _MIN_REFERENCE_MARGIN = 0.3, 0.15  # relative to the swing of the lines at a pixel
+_RESPONSES = (1.0, 1.5, 2.0, 2.5)  # powers that make a camera's image linear
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,10 +147,21 @@ class Lighting:
     """Lighting of the whole image, measured from white and black.
 
     lit : fraction of the image that the projector lights. threshold_dn : minimum of white − black for a lit pixel.
+    saturated : fraction of the lit pixels that are near full scale in white.
     """
 
     lit: float
     threshold_dn: float
+    saturated: float
+
+    def explain(self, fault: str) -> str:
+        """Return a fault of frames that are not proven damaged, after overexposure where that can be the cause."""
+        if self.saturated < _OVEREXPOSED:
+            return fault
+        return (
+            f"the white frame is saturated on {self.saturated:.0%} of what the projector lights: shorten the exposure "
+            f"or lower the gain. If it stays: {fault}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +226,7 @@ def measure_lighting(white: Samples, black: Samples, *, full_scale: int, row: ND
             f"the white frame is saturated on {saturated:.0%} of what the projector lights ({levels}): shorten the "
             "exposure or lower the gain"
         )
-    return Lighting(float(np.mean(lit)), threshold)
+    return Lighting(float(np.mean(lit)), threshold, float(np.mean(white[lit] >= NEAR_SATURATION * full_scale)))
 
 
 def build_reference(
@@ -522,14 +536,15 @@ def _min_pair_sum(swing: Samples) -> Samples:
 
 
 def roughness_fault(frame: Samples, others: Sequence[Samples], ref: ReferenceFrames, *, noise: float) -> str | None:
-    """Describe a band in which a frame is rougher than frames of equally fine patterns: it was damaged there.
+    """Describe a band in which a frame is rougher than each frame of equally fine patterns: it was damaged there.
 
     Roughness is the mean difference of adjacent pixels. It is the same in a bit and its inverse, and in all line
     frames, for any response of camera and projector. Lit areas may be rougher than dark ones, by their noise and by
     unevenness of white itself.
     """
     roughness, light = _roughness(frame, ref)
-    typical = np.median([_roughness(each, ref)[0] for each in others], axis=0)
+    # The few pixels that overexposure leaves may all lie at one edge, which some of the other frames have as well.
+    typical = np.max([_roughness(each, ref)[0] for each in others], axis=0)
     hidden = _NOISE_ROUGHNESS * noise / float(np.median(ref.contrast[ref.tested]))
     excess = roughness - _ROUGHNESS_RATIO * typical - _ROUGHNESS_MARGIN * (1 + np.clip(light, 0, 1)) - hidden
     worst = int(np.nanargmax(np.append(excess, 0.0)))
@@ -575,6 +590,20 @@ def decode_samples(differences: Sequence[Samples], ref: ReferenceFrames) -> Deco
     stack = np.stack(differences)
     certain = ref.lit & (np.abs(stack) > 0.2 * ref.contrast).all(axis=0)
     return DecodedCode(gray_index(stack > 0), certain, len(stack), stack)
+
+
+def within_the_light(
+    ref: ReferenceFrames, code: DecodedCode, gray: Gray, line: LineShift, projector: Size | None
+) -> ReferenceFrames:
+    """Leave out pixels within a period of the ends of the projector's image, which see a part of a line where others
+    see all of it: in an overexposed image many of the others are clipped. Without the projector's size, keep all.
+    """
+    if projector is None:
+        return ref
+    first_px = gray.cell_px * code.index - gray.offset_px
+    inner = (first_px >= line.period_px) & (first_px + gray.cell_px <= projector.along(line.axis) - line.period_px)
+    tested = ref.tested & (inner | ~code.certain)
+    return replace(ref, tested=tested) if np.count_nonzero(tested) >= BAND_SAMPLES else ref
 
 
 @dataclass(frozen=True, slots=True)
@@ -682,29 +711,21 @@ def reference_level_fault(
     have affected that selection. lines : sorted by shift. threshold_dn : minimum light that a pixel gets from lines.
     """
     stack = np.stack(lines)
-    if len(stack) % 2:
-        average, swing = stack.mean(axis=0), np.ptp(stack, axis=0)
-    else:
-        # Use the median over lines and their inverses, to ignore a single damaged line frame.
-        half = len(stack) // 2
-        average = np.median(stack[:half] + stack[half:], axis=0) / 2
-        second = np.sort(stack, axis=0)[[1, -2]]
-        swing = second[1] - second[0]
+    swing = _average_and_swing(stack)[1]
     # Clipped samples add up to less.
     unclipped_lines = stack.max(axis=0) < NEAR_SATURATION * full_scale
-    clipped = white >= NEAR_SATURATION * full_scale
     lit = unclipped_lines & (swing >= max(threshold_dn, _MIN_LINE_LIGHT * float(np.percentile(swing, 99))))
-    unclipped = ~clipped[lit]
+    unclipped = (white < NEAR_SATURATION * full_scale)[lit]
     if np.count_nonzero(unclipped) < BAND_SAMPLES:
         return None
-    off = ((white + black - 2 * average) / np.maximum(swing, 1))[lit]
-    usual = float(np.median(off[unclipped]))
+    frames = np.maximum(np.stack([white, black, *stack])[:, lit] / np.float32(full_scale), 0)
+    # Of a camera that compresses bright light, it depends on how well lines are resolved. In linear light it does not.
+    levels = (_level_of(np.asarray(frames**power, np.float32), unclipped) for power in _RESPONSES)
+    off, wrong, usual = min(levels, key=lambda level: abs(level[2]))
     slack = max(_REFERENCE_LEVEL_TOLERANCE, 6 * 1.4826 * float(np.median(np.abs(off - usual)[unclipped])))
     # A clipped white is darker than the lines predict, never brighter.
     off[~unclipped] = np.maximum(off[~unclipped], usual)
-    wrong = (np.abs(off - usual) > slack) | (
-        np.minimum(white - average, average - black) < _MIN_REFERENCE_MARGIN * swing
-    )[lit]
+    wrong |= np.abs(off - usual) > slack
     where = describe_worst_lit(wrong, row[lit], max_total=0.05, max_in_band=0.1)
     if where is None:
         return None
@@ -712,6 +733,26 @@ def reference_level_fault(
         f"{where} are not as far above the mean of the line frames in white as below it in black: one of these two was "
         "damaged in transfer or shows another pattern; check the cable, and scan again"
     )
+
+
+def _level_of(frames: Samples, unclipped: SampleMask) -> tuple[Samples, SampleMask, float]:
+    """Return how far white and black are from twice the mean of the lines, relative to their swing; the mask of pixels
+    where one of the two is not clearly beyond that mean; and the median of the former. frames : white, black, lines.
+    """
+    white, black = frames[:2]
+    average, swing = _average_and_swing(frames[2:])
+    off = np.asarray((white + black - 2 * average) / np.maximum(swing, np.float32(1e-6)))
+    wrong = np.asarray(np.minimum(white - average, average - black) < _MIN_REFERENCE_MARGIN * swing)
+    return off, wrong, float(np.median(off[unclipped]))
+
+
+def _average_and_swing(lines: Samples) -> tuple[Samples, Samples]:
+    if len(lines) % 2:
+        return lines.mean(axis=0), np.ptp(lines, axis=0)
+    # Use the median over lines and their inverses, to ignore a single damaged line frame.
+    half = len(lines) // 2
+    second = np.sort(lines, axis=0)[[1, -2]]
+    return np.median(lines[:half] + lines[half:], axis=0) / 2, second[1] - second[0]
 
 
 def predict_lines(code: DecodedCode, gray: Gray, line: LineShift, ref: ReferenceFrames) -> LineExpectation:
@@ -797,11 +838,15 @@ def line_sum_fault(
     shift.
 
     Each pixel is lit by one frame as every other pixel is by another, so the sum is the same everywhere, also with a
-    non-linear camera or a scaler. A frame is suspect if subtracting the error of the sum from it leaves its light
-    between black and white. half : the lines light half of their period; then all sums contain so much light that
-    pixels as wide as a line differ less.
+    scaler, or a non-linear camera that sees the lines equally sharp. A frame is suspect if subtracting the error of the
+    sum from it leaves its light between black and white. half : the lines light half of their period; then all sums
+    contain so much light that pixels as wide as a line differ less, and the sum of white tells the camera's response.
     """
-    light = np.stack([ref.relative(frame) for frame in frames])
+    powers = _RESPONSES if half else (1.0,)
+    light = min(
+        (_linear_light(frames, ref, power) for power in powers),
+        key=lambda each: abs(np.median(each.sum(axis=0)) - len(frames) / 2),
+    )
     total = light.sum(axis=0)
     off = total - np.median(total)
     spread = 1.4826 * float(np.median(np.abs(off)))
@@ -820,6 +865,12 @@ def line_sum_fault(
         f"on {where} the line frames do not add up to what they do elsewhere: one of them was damaged in transfer or "
         "shows another pattern, or something moved; check the cable, and scan again"
     )
+
+
+def _linear_light(frames: Sequence[Samples], ref: ReferenceFrames, power: float) -> Samples:
+    """(n, tested): each frame's part of white, both raised to a power."""
+    white, black, *light = (np.maximum(each[ref.tested], 0) ** power for each in (ref.white, ref.black, *frames))
+    return np.asarray((np.stack(light) - black) / np.maximum(white - black, 1), dtype=np.float32)
 
 
 def line_shape_fault(

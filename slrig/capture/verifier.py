@@ -282,6 +282,7 @@ class FrameVerifier:
         where, rest = describe_frame(self.name, index, self._patterns[index]), set(further) - set(suspects)
         # Light beyond the camera's range is a wrong exposure, and no unusual light.
         is_doubt = is_doubt and not self._is_overexposed
+        fault = fault if wrong or self.lighting is None else self.lighting.explain(fault)
         every = tuple(sorted(set(suspects)))
         return Contradiction(self.name, where, fault, every, tuple(sorted(rest)), is_doubt, tuple(wrong))
 
@@ -743,6 +744,7 @@ class FrameVerifier:
             return []
         members = [first_index[line] for line in family]
         frames = [self._corrected(each) for each in members]
+        ref = frame_checks.within_the_light(ref, *self.findings.codes[axis], family[0], self._projector)
         found = self._check_line_light(family, members, frames, ref)
         if found:
             lights = frame_light.line_lights(frames, ref)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import combinations, product
 from typing import Any
 
@@ -20,6 +21,7 @@ from slrig.capture.frame_checks import (
     find_repeated,
     line_sum_fault,
     pair_noise_dn,
+    reference_level_fault,
     roughness_fault,
 )
 from slrig.capture.verifier import Evidence, EvidenceSummary, Sampler, check_capture
@@ -644,6 +646,21 @@ def test_lines_reveal_damage_to_white_and_black(index: int, damage: Spoil, seque
     assert recorded_summary(with_image(shots, index, damage(shots, index)), patterns).faults
 
 
+@pytest.mark.parametrize("sequence", [SequenceName.FAST, SequenceName.STANDARD])
+def test_what_overexposure_leaves_is_no_damage(sequence: SequenceName) -> None:
+    patterns = SINGLE[sequence]
+    shots, brighter = (
+        Scene(noise_dn=1.0, white=white, gamma=2.2, ambient=0.05, blur_px=1.6).shots(patterns) for white in (2.0, 5.0)
+    )
+    assert recorded_summary(shots, patterns).faults == ()
+    too_bright = recorded_summary(brighter, patterns).faults
+    assert too_bright
+    assert all("the white frame is saturated on" in each and "shorten the exposure" in each for each in too_bright)
+    (spoilt, *_) = recorded_summary(with_image(shots, 5, garbled(shots, 5)), patterns).faults
+    assert "pattern 5 " in spoilt
+    assert "damaged" in spoilt
+
+
 def test_a_line_frame_with_rows_of_another_is_found() -> None:
     """Lines at a quarter of their period light half of every cell: the code says nothing of them."""
     patterns = SINGLE[SequenceName.STANDARD]
@@ -733,6 +750,22 @@ def lines(width_px: int = 1) -> list[Samples]:
 @pytest.mark.parametrize("width_px", [1, 3])
 def test_line_frames_add_up_alike_everywhere_whatever_the_response(ref: ReferenceFrames, width_px: int) -> None:
     assert line_sum_fault(lines(width_px), ref, noise=NOISE_DN) is None
+
+
+def test_lines_that_a_camera_resolves_less_in_places_are_no_damage(ref: ReferenceFrames) -> None:
+    """Its response is compressed, so that they are brighter there on average."""
+    frames = []
+    for shift in range(PERIOD):
+        image = camera_image(stripes(4, shift, blur_px=0.3))
+        image[150:] = camera_image(stripes(4, shift, blur_px=2.0))[150:]
+        frames.append(sample(image))
+    assert line_sum_fault(frames, ref, noise=NOISE_DN, half=True) is None
+    level = partial(reference_level_fault, threshold_dn=20, full_scale=255, row=SAMPLER.row)
+    assert level(ref.white, ref.black, frames) is None
+    darker = np.where(SAMPLER.row < 80, 0.7 * ref.white, ref.white).astype(np.float32)
+    fault = level(darker, ref.black, frames)
+    assert fault is not None
+    assert "damaged in transfer" in fault
 
 
 def test_a_garbled_line_frame_is_found_by_the_sum(ref: ReferenceFrames) -> None:
