@@ -54,6 +54,9 @@ _EVEN_SPREAD = 0.08
 _ROUGHNESS_RATIO, _ROUGHNESS_MARGIN = 1.25, 0.15
 """Tolerances of roughness, chosen above that of a projector with dithering. Random bytes have a third of full scale."""
 
+_MIN_LINE_SWING = 0.5
+"""Of white, over all line frames: a wall at a grazing view shows coarse bits where it shows no lines."""
+
 _NOISE_ROUGHNESS = 1.5
 """Two samples of normal noise differ by 1.13 standard deviations on average."""
 
@@ -535,16 +538,25 @@ def _min_pair_sum(swing: Samples) -> Samples:
     return np.asarray(np.interp(swing, _SWING, _SUM), dtype=np.float32)
 
 
-def roughness_fault(frame: Samples, others: Sequence[Samples], ref: ReferenceFrames, *, noise: float) -> str | None:
+def roughness_fault(
+    frame: Samples, others: Sequence[Samples], ref: ReferenceFrames, *, noise: float, by_lines: bool = False
+) -> str | None:
     """Describe a band in which a frame is rougher than each frame of equally fine patterns: it was damaged there.
 
     Roughness is the mean difference of adjacent pixels. It is the same in a bit and its inverse, and in all line
     frames, for any response of camera and projector. Lit areas may be rougher than dark ones, by their noise and by
-    unevenness of white itself.
+    unevenness of white itself. by_lines : a bit is compared with lines, where the camera resolves these.
     """
     roughness, light = _roughness(frame, ref)
     # The few pixels that overexposure leaves may all lie at one edge, which some of the other frames have as well.
     typical = np.max([_roughness(each, ref)[0] for each in others], axis=0)
+    if by_lines:
+        swing = np.ptp([(each - ref.black) / ref.contrast for each in others], axis=0)
+        counts = np.bincount(ref.band[ref.tested], minlength=BANDS)
+        resolved = np.bincount(ref.band[ref.tested], swing[ref.tested], BANDS) >= _MIN_LINE_SWING * np.maximum(
+            counts, 1
+        )
+        typical = np.where(resolved, typical, np.nan)
     hidden = _NOISE_ROUGHNESS * noise / float(np.median(ref.contrast[ref.tested]))
     excess = roughness - _ROUGHNESS_RATIO * typical - _ROUGHNESS_MARGIN * (1 + np.clip(light, 0, 1)) - hidden
     worst = int(np.nanargmax(np.append(excess, 0.0)))

@@ -492,7 +492,7 @@ class FrameVerifier:
             if isinstance(p, LineShift) and p.axis is pattern.axis and p.is_half_lit
         ]  # fmt: skip
         # Bits have fewer edges than lines. Edges of narrow lines are less high, so they cannot be compared.
-        rough = frame_checks.roughness_fault(frame, lines, ref, noise=self._noise) if lines else None
+        rough = frame_checks.roughness_fault(frame, lines, ref, noise=self._noise, by_lines=True) if lines else None
         if rough is not None:
             return [self._contradiction(index, rough, [index], self._unconfirmed_references, wrong=[index])]
         if is_coarse:

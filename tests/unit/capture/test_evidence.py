@@ -737,6 +737,18 @@ def test_a_garbled_frame_is_rougher_than_its_inverse(ref: ReferenceFrames, perio
     assert roughness_fault(inverse, [sample(noisy_band(bit))], ref, noise=NOISE_DN) is None
 
 
+@pytest.mark.parametrize("resolved", [True, False])
+def test_a_bit_is_as_rough_as_lines_only_where_the_camera_resolves_them(ref: ReferenceFrames, resolved: bool) -> None:
+    """A wall at a grazing view shows coarse bits, and lines as an even grey."""
+    lights = [stripes(8, shift, period_px=16) if resolved else np.full(SIZE.width_px, 0.5) for shift in range(0, 16, 4)]
+    lines, bit = [sample(camera_image(light)) for light in lights], camera_image(stripes(2, period_px=4, blur_px=0.2))
+    if not resolved:
+        assert roughness_fault(sample(bit), lines, ref, noise=NOISE_DN) is not None
+    spoilt = bit if not resolved else noisy_band(camera_image(stripes(8, period_px=16)))
+    fault = roughness_fault(sample(spoilt), lines, ref, noise=NOISE_DN, by_lines=True)
+    assert (fault is not None) == resolved
+
+
 def test_pixel_flicker_is_not_damage(ref: ReferenceFrames) -> None:
     """A projector that dithers: all is lit in one frame of a pair, and nothing in the other."""
     lit = camera_image(np.ones(SIZE.width_px)) * (1 + RANDOM.normal(0, 0.13, SIZE.shape))
