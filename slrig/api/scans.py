@@ -21,10 +21,12 @@ from slrig.api.schemas import (
     ScanPage,
     ScanRequest,
     ScanSeries,
+    UncalibratedRequest,
     filled,
     listed_links,
     scan_body,
     scan_plan,
+    scan_unit,
 )
 from slrig.api.service import Cursor, IdempotencyKey, PageLength, Service, Serving, paged, started_once
 from slrig.bundle import AwareMoment, PresetDocument, PresetName, SafeText, Strict
@@ -34,7 +36,7 @@ from slrig.model import MAX_MASK_CHARACTERS, MeshAxes
 from slrig.scan.exposure import proposed_exposures
 from slrig.scan.formats import PREVIEW, THUMBNAIL
 from slrig.scan.job import cancel_series as _cancel_series
-from slrig.scan.job import scans_of, series
+from slrig.scan.job import scans_of, series, with_guess
 from slrig.scan.plan import PresetSource
 
 MOST_SCAN_BYTES = 4 * MAX_MASK_CHARACTERS
@@ -134,14 +136,27 @@ def cancel_series(service: Serving, series_id: UUID) -> ScanSeries:
     return ScanSeries(scans=[_body(service, record) for record in _cancel_series(service.manager, series_id)])
 
 
-@router.post("/{scan_id}/reconstruct", status_code=202, responses=problems(409, 410, 503, 507))
-def reconstruct_scan(service: Serving, scan_id: UUID) -> ScanBody:
+class ReconstructAgain(Strict):
+    """What is to be otherwise when a scan is made anew."""
+
+    uncalibrated: UncalibratedRequest | None = Field(
+        default=None,
+        description="of a scan that was asked for with guesses: these in place of them, as for another baseline. "
+        "Default: everything as it was",
+    )
+
+
+@router.post("/{scan_id}/reconstruct", status_code=202, responses=problems(409, 410, 422, 503, 507))
+def reconstruct_scan(
+    service: Serving, scan_id: UUID, request: Annotated[ReconstructAgain, Body(default_factory=ReconstructAgain)]
+) -> ScanBody:
     """Make mesh and files of a finished scan anew from its bundle, as after a failure, damage or an update. Its files
     stay until then. Follow `links.events` for the rest.
     """
-    service.store.get(scan_id, JobKind.SCAN)
+    record = service.store.get(scan_id, JobKind.SCAN)
+    asked = None if request.uncalibrated is None else with_guess(record, request.uncalibrated.guess())
     with service.models.unused(scan_id):
-        return _body(service, service.manager.compute_again(scan_id))
+        return _body(service, service.manager.compute_again(scan_id, asked))
 
 
 @router.put("/{scan_id}/pin")
@@ -172,6 +187,7 @@ def _listed(service: Service, record: JobRecord) -> ListedScan:
         sigma_mm=(mesh.get("sigma_mm") or {}).get("p50"),
         turn_deg=record.plan.get("turn_deg"),
         preset=(record.plan.get("preset") or {}).get("name"),
+        unit=scan_unit(record),
         links=listed_links(record, service.folder.scan(record.id) / PREVIEW, THUMBNAIL),
     )
 

@@ -45,6 +45,7 @@ from slrig.scan.plan import (
     ReconstructionPlan,
     RigGuess,
     ScanPlan,
+    length_unit,
     unused_options,
 )
 
@@ -419,10 +420,18 @@ class ListedJob(JobFacts):
     links: ListedLinks
 
 
+LengthUnit = Annotated[
+    str,
+    Field(description="of lengths in its files and figures: mm, or % of baseline where no calibration and no baseline "
+          "are known"),
+]  # fmt: skip
+
+
 class ScanBody(JobBody):
     """A scan on record."""
 
     plan: AskedPlan[ScanPlan]
+    unit: LengthUnit
     pinned: bool = Field(description="kept, whatever the settings say of old scans")
     links: ScanLinks
 
@@ -432,6 +441,7 @@ class ListedScan(ListedJob):
 
     turn_deg: float | None = Field(description="angle of the turntable; null where nothing was turned")
     preset: str | None = Field(description="the name of the preset that was asked for; null without one")
+    unit: LengthUnit
 
 
 class ScanSeries(BaseModel):
@@ -459,7 +469,13 @@ def scan_body(record: JobRecord, files: Mapping[str, str]) -> ScanBody:
     here = f"/scan/{record.id}"
     series = None if record.parent is None else f"/scan/series/{record.parent}"
     links = ScanLinks(self=here, events=f"{here}/events", cancel=f"{here}/cancel", series=series, files=dict(files))
-    return filled(ScanBody, record, error=record.fault, links=links)
+    return filled(ScanBody, record, error=record.fault, unit=scan_unit(record), links=links)
+
+
+def scan_unit(record: JobRecord) -> str:
+    """Unit of a scan's lengths, also where the record of what was asked is damaged."""
+    guess = (record.plan.get("reconstruction") or {}).get("uncalibrated")
+    return length_unit(None if guess is None else RigGuess(baseline_mm=guess.get("baseline_mm")))
 
 
 Extent = Annotated[

@@ -101,9 +101,12 @@ class Scans(Resource):
         """Stop a scan between two frames."""
         return self._connection.json("POST", path("/scan/{}/cancel", scan_id))
 
-    def reconstruct(self, scan_id: str) -> Json:
-        """Make mesh and files of a finished scan anew from its bundle; `Client.job` follows it."""
-        return self._connection.json("POST", path("/scan/{}/reconstruct", scan_id))
+    def reconstruct(self, scan_id: str, *, uncalibrated: Mapping[str, Any] | None = None) -> Json:
+        """Make mesh and files of a finished scan anew from its bundle; `Client.job` follows it. uncalibrated : other
+        guesses of a rig without a calibration, such as {"baseline_mm": 180}.
+        """
+        options = given(uncalibrated=uncalibrated)
+        return self._connection.json("POST", path("/scan/{}/reconstruct", scan_id), json=options)
 
     def pin(self, scan_id: str) -> Json:
         """Keep a scan, even where the settings delete old ones."""

@@ -291,14 +291,15 @@ class JobManager:
         with self._changed:
             self._line_up([self._work(job, record, holder, captured=captured)])
 
-    def compute_again(self, job_id: UUID) -> JobRecord:
+    def compute_again(self, job_id: UUID, asked: Job | None = None) -> JobRecord:
         """Have a finished job computed once more from its bundle; what comes of it takes the place of its files then.
+        asked : what is computed in place of what is on record.
 
         Raises JobNotFoundError; ScanStateError where it is not over, or of a kind that is not computed from its bundle
         alone; ArtefactNotReadyError without a bundle; DamagedError where that is damaged; StorageError.
         """
         record = self.store.get(job_id)
-        job = self.kinds[record.kind].from_record(record)
+        job = asked or self.kinds[record.kind].from_record(record)
         place = job.place(self.data, job_id)
         if not record.state.final or not job.movable or place is None:
             message = f"{record.kind.capitalize()} {job_id} is {record.state}, and cannot be computed again."
@@ -313,6 +314,7 @@ class JobManager:
         with self._changed:
             if self._ending:
                 raise interruption_error()
+            self.store.replan(job_id, record.plan if asked is None else asked.document())
             self.store.advance(job_id, JobState.COMPUTING)
         self.begin(job, record, captured=True)
         return self.store.get(job_id)

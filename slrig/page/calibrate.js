@@ -39,6 +39,8 @@ function Calibrations({rig, able}) {
         ${each.verdict && html`<span class="clip">${begun(each.verdict)}.</span>`}
       </a></li>`)}</ul>
       <${Importing} able=${able} />
+      ${rig?.calibrated === false && html`<h3>Without a board</h3>
+        <p>One scan of something with depth calibrates the rig roughly: its shape may be wrong by some tenths of a percent, and the scan says by how much. <a href="#/scan">Scan without a calibration</a></p>`}
     </section>
   </div>`;
 }

@@ -15,11 +15,11 @@ const FITTED = ["plane", "sphere", "cylinder"];
 const USUAL_PATCH = 0.06;
 
 /** As many digits as its standard deviation lets one read. */
-const millimetres = (mm, sigmaMm) => `${number(mm, {decimals: sigmaMm > 0 ? Math.min(Math.max(-Math.floor(Math.log10(sigmaMm / 3)), 1), 4) : 3})}\u00a0mm`;
-const figure = ({kind, valueMm, sigmaMm}) => `${["sphere", "cylinder"].includes(kind) ? "radius " : ""}${millimetres(valueMm, sigmaMm)}, σ ${length(sigmaMm)}`;
+const digits = (mm, sigmaMm, unit) => `${number(mm, {decimals: sigmaMm > 0 ? Math.min(Math.max(-Math.floor(Math.log10(sigmaMm / 3)), 1), 4) : 3})}\u00a0${unit}`;
+const figure = ({kind, valueMm, sigmaMm}, unit) => `${["sphere", "cylinder"].includes(kind) ? "radius " : ""}${digits(valueMm, sigmaMm, unit)}, σ ${length(sigmaMm, unit)}`;
 
-/** All that measuring needs to know, and what changes it. */
-export function useMeasuring(view) {
+/** All that measuring needs to know, and what changes it. `unit`: of the mesh's lengths, which are called mm here. */
+export function useMeasuring(view, unit = "mm") {
   const [on, setOn] = useState(false);
   const [kind, setKind] = useState("distance");
   const [typed, setTyped] = useState(null);
@@ -37,7 +37,7 @@ export function useMeasuring(view) {
     if (!hit) return;
     const pick = FITTED.includes(kind) && picks.length === 0 ? {...hit, patchMm, form: fit(kind, patch(hit.mesh, hit.pointMm, patchMm))} : hit;
     if (pick.form === null) {
-      setRefused(`Too little surface within ${length(patchMm)} of that point to fit a ${kind}. Choose a larger patch, or click elsewhere.`);
+      setRefused(`Too little surface within ${length(patchMm, unit)} of that point to fit a ${kind}. Choose a larger patch, or click elsewhere.`);
       return;
     }
     setRefused(null);
@@ -52,7 +52,7 @@ export function useMeasuring(view) {
     else setRefused("The surface has a gap between the two points, or they lie on two scans. Choose points on one piece of surface.");
   };
   return {
-    on, kind, patchMm, typed, setTyped, picks, done, refused, choose, take,
+    on, kind, unit, patchMm, typed, setTyped, picks, done, refused, choose, take,
     toggle: () => {
       setOn(!on);
       setPicks([]);
@@ -75,9 +75,9 @@ function resultOf(kind, [first, second]) {
 }
 
 /** What is measured, the patch that is fitted, and how to take back. */
-export function MeasureBar({measuring: {kind, choose, typed, patchMm, setTyped, done, back, clear}}) {
+export function MeasureBar({measuring: {kind, unit, choose, typed, patchMm, setTyped, done, back, clear}}) {
   return html`<${Choice} label="Measure what" value=${kind} options=${KINDS} chosen=${choose} />
-    ${FITTED.includes(kind) && html`<${Field} label="Patch radius, mm" value=${typed ?? patchMm} change=${setTyped} />`}
+    ${FITTED.includes(kind) && html`<${Field} label=${`Patch radius, ${unit}`} value=${typed ?? patchMm} change=${setTyped} />`}
     ${done.length > 0 && html`<${Action} onClick=${back}>Remove the last<//><${Action} onClick=${clear}>Clear<//>`}`;
 }
 
@@ -92,11 +92,11 @@ export function Marks({view, measuring, pointed}) {
   return html`<svg aria-hidden="true">
     ${marked.map(({kind, picks, ...found}) => html`
       ${picks.map(({pointMm, patchMm}) => html`<${Dot} at=${place(pointMm)} />${patchMm && html`<circle class="patch" ...${centred(place(pointMm))} r=${patchMm * view.pxPerMm(pointMm)} />`}`)}
-      ${kind && html`<${Line} points=${lineOf(kind, picks, found).map(place)} /><${Words} at=${place(anchorOf(kind, picks, found))} words=${figure({kind, ...found})} />`}
+      ${kind && html`<${Line} points=${lineOf(kind, picks, found).map(place)} /><${Words} at=${place(anchorOf(kind, picks, found))} words=${figure({kind, ...found}, measuring.unit)} />`}
       ${kind === "sphere" && html`<circle class="patch" ...${centred(place(picks[0].form.centre))} r=${picks[0].form.radius * view.pxPerMm(picks[0].form.centre)} />`}`)}
     ${pointed && html`<circle class="pointed" ...${centred(place(pointed))} r="9" />`}
     ${measuring.on && html`<path d=${`M${width / 2 - 8} ${height / 2}h16M${width / 2} ${height / 2 - 8}v16`} />`}
-    ${bar && html`<path d=${`M16 ${height - 70}v6h${bar / view.mmPerPx}v-6`} /><text x="20" y=${height - 74}>${length(bar)}</text>`}
+    ${bar && html`<path d=${`M16 ${height - 70}v6h${bar / view.mmPerPx}v-6`} /><text x="20" y=${height - 74}>${length(bar, measuring.unit)}</text>`}
   </svg>`;
 }
 
@@ -121,11 +121,11 @@ function anchorOf(kind, picks, found) {
   return line.length > 2 ? line[middle] : line[0].map((mm, axis) => (mm + line[1][axis]) / 2);
 }
 
-export function Measured({done, clear}) {
+export function Measured({measuring: {done, unit, clear}}) {
   const at = ({pointMm}) => `(${pointMm.map((mm) => number(mm, {decimals: 3})).join(", ")})`;
   return html`<table class="measured"><thead><tr><th>What</th><th>Value</th><th>σ</th></tr></thead>
-      <tbody>${done.map(({kind, picks, valueMm, sigmaMm}) => html`<tr><td>${TOLD[kind]}</td><td>${millimetres(valueMm, sigmaMm)}</td><td>${length(sigmaMm)}</td></tr>
-        <tr class="quiet"><td colspan="3">${picks.map(at).join(" to ")} mm${picks[0].form && `; fit of ${count(picks[0].form.points)} points, rms ${length(picks[0].form.rmsMm)}`}</td></tr>`)}</tbody></table>
+      <tbody>${done.map(({kind, picks, valueMm, sigmaMm}) => html`<tr><td>${TOLD[kind]}</td><td>${digits(valueMm, sigmaMm, unit)}</td><td>${length(sigmaMm, unit)}</td></tr>
+        <tr class="quiet"><td colspan="3">${picks.map(at).join(" to ")} ${unit}${picks[0].form && `; fit of ${count(picks[0].form.points)} points, rms ${length(picks[0].form.rmsMm, unit)}`}</td></tr>`)}</tbody></table>
     <p class="quiet">σ comes from that of the mesh: noise, and the calibration's error where that is stated. A fitted patch counts as 16 independent points, because neighbours err alike.
       Not in it: where you clicked, and what all points share, such as a wrong scale.</p>
     <${Action} onClick=${clear}>Clear<//>`;

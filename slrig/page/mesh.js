@@ -73,7 +73,7 @@ export function Mesh({scan, other = null, report, calibration = null, again, ove
   const drawn = alone && !told.values ? "shaded" : mode;
   useEffect(() => view?.set(drawn, form, range, told.kinds.map(({colour}) => colour), shown), [view, drawn, form, ...range, told.kinds, ...shown]);
   useEffect(() => view?.limit(scan.plan?.reconstruction?.region?.box_mm), [view, scan.id]);
-  const measuring = useMeasuring(view);
+  const measuring = useMeasuring(view, scan.unit);
   const ready = view !== null && meshes.full !== undefined;
   const take = (x, y) => measuring.take(view.pick(x, y));
   const looked = useRef();
@@ -111,7 +111,7 @@ export function Mesh({scan, other = null, report, calibration = null, again, ove
     ${over && html`<div class="over middle">${over}</div>`}
     ${problem && html`<div class="over middle"><${Refusal} problem=${problem} /></div>`}`;
   const top = html`<${Choice} label="Colours" value=${mode} options=${offered} chosen=${setMode} /><${Choice} label="Form" value=${form} options=${FORMS} chosen=${setForm} />`;
-  const bottom = html`<div class="notes"><${Legend} mode=${mode} range=${range} axis=${report?.axis} styles=${styles} told=${told} other=${other} back=${form === "surface"} />
+  const bottom = html`<div class="notes"><${Legend} mode=${mode} range=${range} axis=${report?.axis} styles=${styles} told=${told} other=${other} back=${form === "surface"} unit=${scan.unit} />
       <p role="status">${mine}${other && ` Other scan: ${theirs}`}${told.busy && ` ${told.busy}`}</p></div>
     <div class="bar">
       <${Action} aria-pressed=${measuring.on} disabled=${!ready} onClick=${measuring.toggle}>Measure<//>
@@ -122,7 +122,7 @@ export function Mesh({scan, other = null, report, calibration = null, again, ove
         chosen=${(value) => setShown(value.split(",").map((each) => each === "true"))} />`}
       ${again && html`<${Action} disabled=${!view} onClick=${() => again(view.seen())}>Limit the next scan to this view<//>`}`}
     </div>`;
-  const measured = measuring.done.length > 0 && html`<${Panel} key="measured" name="Measurements"><${Measured} done=${measuring.done} clear=${measuring.clear} /><//>`;
+  const measured = measuring.done.length > 0 && html`<${Panel} key="measured" name="Measurements"><${Measured} measuring=${measuring} /><//>`;
   return html`<${Workspace} label="Mesh" stage=${stage} top=${top} bottom=${bottom} keys=${keys}>${children && html`${head}${measured}${children}`}<//>
     ${!children && measured}`;
 }
@@ -174,20 +174,20 @@ function useRange(mode, scan, report, coarse, told) {
   return most > least ? [least, most] : [least, least + 1];
 }
 
-const inMm = (mm) => `${number(mm)}\u00a0mm`;
+const inUnit = (mm, unit = "mm") => `${number(mm)}\u00a0${unit}`;
 const SCALES = {
-  sigma: ["Standard deviation along the normal; the ends are the 5 % and 95 % of this scan.", (value) => inMm(value * SIGMA_STEP_MM)],
+  sigma: ["Standard deviation along the normal; the ends are the 5 % and 95 % of this scan.", (value, unit) => inUnit(value * SIGMA_STEP_MM, unit)],
   stripe: ["Projector line.", (value) => `${count(value)}\u00a0px`],
-  depth: ["Depth, z of the scan's axes; nearer is less.", inMm],
-  deviation: ["Distance to the other scan; orange lies before it, blue behind.", inMm],
+  depth: ["Depth, z of the scan's axes; nearer is less.", inUnit],
+  deviation: ["Distance to the other scan; orange lies before it, blue behind.", inUnit],
 };
 
-function Legend({mode, range: [least, most], axis, styles, told, other, back}) {
+function Legend({mode, range: [least, most], axis, styles, told, other, back, unit}) {
   if (SCALES[mode]) {
     const [words, written] = SCALES[mode];
     return html`<div class="scale"><p>${mode === "stripe" ? `Projector ${axis ?? "column"}.` : words} Grey: not known.</p>
       <div style=${{background: mode === "deviation" ? styles.signed : styles.scale}}></div>
-      <div class="between">${[least, (least + most) / 2, most].map((value) => html`<span>${written(value)}</span>`)}</div>${told.words && html`<p>${told.words}</p>`}</div>`;
+      <div class="between">${[least, (least + most) / 2, most].map((value) => html`<span>${written(value, unit)}</span>`)}</div>${told.words && html`<p>${told.words}</p>`}</div>`;
   }
   const entries = mode === "cause" || mode === "views" ? told.kinds.filter(({share}) => share > LEAST_SHARE).sort((a, b) => b.share - a.share).map(({colour, words, share}) => [colour, `${words}, ${percent(share)}`])
     : mode === "shaded" ? [...other ? [[PLAIN[0], "this scan"], [PLAIN[1], "the other"]] : [], ...back ? [[styles.back, "back side"]] : []] : [];

@@ -7,27 +7,31 @@ import {Mesh, loadDrawing} from "./mesh.js";
 import {NameHeading} from "./names.js";
 import {ask, follow, once, useAction, useValue} from "./service.js";
 import {Action, Facts, JobBadge, Progress, Refusal, count, length, moment, percent} from "./ui.js";
+import {FoundCalibration, OtherGuesses} from "./uncalibrated.js";
 import {Panel, Workspace} from "./workspace.js";
-import {html, useEffect, useState} from "./vendor/preact-htm.js";
+import {html, useEffect, useRef, useState} from "./vendor/preact-htm.js";
 
 const OVER = ["succeeded", "failed", "cancelled", "interrupted"];
 const MESH = "mesh.ply";
 const LOOK_AGAIN_S = 10;
 
-export function ResultScreen({id, may}) {
+export function ResultScreen({id, rig, may}) {
   const [scan, problem, again] = useValue(`/scan/${encodeURIComponent(id)}`, LOOK_AGAIN_S);
+  const made = useRef([]);
   useEffect(() => {
     loadDrawing().catch(() => {});
   }, []);
   if (problem?.status === 404 || problem?.status === 422)
     return html`<${Back} /><${Refusal} problem=${{document: {title: "Scan not found"}, message: "It was deleted, or the address is not right."}} />`;
   if (!scan) return html`<${Back} /><${Refusal} problem=${problem} />${!problem && html`<p class="wait">Asking for the scan …</p>`}`;
-  return html`<${Result} scan=${scan} again=${again} may=${may} />`;
+  if (scan.finished_at && made.current.at(-1) !== scan.finished_at) made.current.push(scan.finished_at);
+  // What was computed again is fetched again.
+  return html`<${Result} key=${Math.max(made.current.length, 1)} scan=${scan} rig=${rig} again=${again} may=${may} />`;
 }
 
 const Back = () => html`<p><a href="#/scan/all">All scans</a> · <a href="#/scan">Live picture</a></p>`;
 
-function Result({scan, again, may}) {
+function Result({scan, rig, again, may}) {
   const {files} = scan.links;
   const over = OVER.includes(scan.state);
   const [told, setTold] = useState(scan.progress);
@@ -46,7 +50,8 @@ function Result({scan, again, may}) {
   const head = html`<div class="head"><${Back} />
       <${NameHeading} job=${scan} kind="Scan" may=${may("scan")} again=${again}><${JobBadge} state=${scan.state} /><//>
       ${Object.keys(files).length > 0 && html`<${Downloads} files=${files} />`}</div><${Refusal} problem=${refused} />`;
-  const panels = html`${hasMesh && html`<${Panel} name="Figures"><${Figures} scan=${scan} report=${report} /><//>`}
+  const panels = html`${hasMesh && report?.self_calibration && html`<${Panel} name="Calibration by this scan"><${FoundCalibration} scan=${scan} report=${report} rig=${rig} may=${may} changed=${again} /><//>`}
+    ${hasMesh && html`<${Panel} name="Figures"><${Figures} scan=${scan} report=${report} /><//>`}
     ${report && Object.entries(report.cameras).map(([name, camera]) => html`<${Panel} key=${name} name=${`Camera ${name}`}>
       <${Causes} camera=${name} told=${camera} causes=${report.causes} files=${files} device=${calibration?.cameras[name] ?? null} pointed=${pointed} point=${point} /><//>`)}
     ${over && hasMesh && html`<${Panel} name="Compare"><${Compare} scan=${scan} chosen=${setOther} /><//>`}
@@ -54,11 +59,11 @@ function Result({scan, again, may}) {
   if (hasMesh)
     return html`<${Mesh} key=${scan.id} scan=${scan} other=${other} report=${report} calibration=${calibration} again=${may("scan") ? limitToBox : null} over=${progress}
       pointed=${pointed} point=${point} head=${head}>${panels}<//>`;
-  return html`<${Workspace} label="Mesh" stage=${html`<div class="over middle">${over ? html`<${Ended} scan=${scan} may=${may} />` : progress}</div>`}>${head}${panels}<//>`;
+  return html`<${Workspace} label="Mesh" stage=${html`<div class="over middle">${over ? html`<${Ended} scan=${scan} rig=${rig} again=${again} may=${may} />` : progress}</div>`}>${head}${panels}<//>`;
 }
 
 /** A scan without a mesh: why, and what now. */
-function Ended({scan, may}) {
+function Ended({scan, rig, again, may}) {
   const titles = {failed: "The scan failed", cancelled: "The scan was stopped", interrupted: "The service ended while it scanned"};
   const [repeat, busy, problem] = useAction(async () => {
     // Not to be asked for: the service fills it in from its hand-eye calibration.
@@ -67,11 +72,13 @@ function Ended({scan, may}) {
     sessionStorage.setItem("asked", made.id);
     location.hash = "#/scan";
   });
-  const [anew, making, refused] = useAction(() => ask("POST", `/scan/${scan.id}/reconstruct`));
+  const guesses = may("scan") && scan.links.files["bundle.zip"] && scan.plan?.reconstruction.uncalibrated;
+  const [anew, making, refused] = useAction(() => ask("POST", `/scan/${scan.id}/reconstruct`).then(again));
   return html`<${Refusal} problem=${{document: {title: titles[scan.state] ?? "There is no mesh"}, message: scan.error?.detail ?? "It gave no mesh."}}>
       ${scan.links.files["bundle.zip"] && html`<p>Its frames are kept: the bundle can be downloaded, to reconstruct it elsewhere or to ask for help.</p>`}
     <//>
-    ${may("scan") && scan.links.files["bundle.zip"] && html`<${Action} busy=${making} onClick=${anew}>Reconstruct again<//>`}
+    ${guesses && html`<${OtherGuesses} scan=${scan} rig=${rig} changed=${again} />`}
+    ${may("scan") && !guesses && scan.links.files["bundle.zip"] && html`<${Action} busy=${making} onClick=${anew}>Reconstruct again<//>`}
     ${may("scan") && scan.plan && html`<${Action} kind="primary" busy=${busy} onClick=${repeat}>Scan again<//>`}
     <${Refusal} problem=${problem ?? refused} />`;
 }
@@ -81,14 +88,17 @@ function Figures({scan, report}) {
   const {summary} = scan;
   const {mesh, notes = []} = summary ?? {};
   if (!mesh) return html`<p class="quiet">The figures come with the report.</p>`;
-  const calibration = report?.calibration;
-  const warnings = [...notes, ...(report?.evidence.contradictions ?? [])];
+  const own = report?.self_calibration;
+  // Its own panel says more of it, and the age of a calibration by the scan itself is none.
+  const calibration = own ? null : report?.calibration;
+  const warnings = [...notes.filter((each) => !own || !each.startsWith("calibrated by this scan alone")), ...(report?.evidence.contradictions ?? [])];
+  const inUnit = (words) => scan.unit === "mm" ? words : words?.replace(/(\d) mm\b/g, `$1 ${scan.unit}`);
   const age = calibration?.age_days;
   return html`
-    ${warnings.length > 0 && html`<h3>Take note</h3><ul class="warning">${warnings.map((each) => html`<li>${each}</li>`)}</ul>`}
+    ${warnings.length > 0 && html`<h3>Take note</h3><ul class="warning">${warnings.map((each) => html`<li>${inUnit(each)}</li>`)}</ul>`}
     <${Facts} of=${[
-      ...figures(scan).map(([name, value, written]) => [name, value === undefined ? null : written(value)]),
-      ["σ holds", summary.mesh.sigma_holds],
+      ...figures(scan).map(([name, value, written]) => [name, value === undefined ? null : written(value, scan.unit)]),
+      ["σ holds", inUnit(summary.mesh.sigma_holds)],
       ["Patterns", summary.identity],
       ["Limited to", limits(scan.plan?.reconstruction?.region)],
       ["Calibration", calibration && (calibration.solved_at ? `${age === null ? "age not known" : `${Number(age.toPrecision(2))} days old`}` : calibration.absent)],
@@ -103,7 +113,7 @@ function Figures({scan, report}) {
 function figures({summary}) {
   const {figures: of, sigma_mm: sigma, covers_of_decoded: covered} = summary.mesh;
   return [
-    ["Triangles", of.triangles, count], ["Vertices", of.vertices, count], ["Area", of.area_mm2, (mm2) => `${count(Math.round(mm2))} mm²`],
+    ["Triangles", of.triangles, count], ["Vertices", of.vertices, count], ["Area", of.area_mm2, (mm2, unit) => `${count(Math.round(mm2))} ${unit === "mm" ? "mm²" : `(${unit})²`}`],
     ["σ, median", sigma.p50, length], ["σ, 95 % are below", sigma.p95, length], ["Decoded pixels that the mesh covers", covered ?? undefined, percent],
   ];
 }
@@ -111,7 +121,7 @@ function figures({summary}) {
 function Compare({scan, chosen}) {
   const [list, problem] = useValue("/scan?limit=50");
   const [id, setId] = useState("");
-  const possible = (list?.scans ?? []).filter((each) => each.id !== scan.id && each.triangles !== null && OVER.includes(each.state));
+  const possible = (list?.scans ?? []).filter((each) => each.id !== scan.id && each.unit === scan.unit && each.triangles !== null && OVER.includes(each.state));
   const [other] = useValue(id ? `/scan/${id}` : null);
   useEffect(() => chosen(id ? other : null), [id, other]);
   const rows = other?.summary?.mesh && scan.summary?.mesh ? figures(scan).map((row, at) => [...row, figures(other)[at][1]]) : [];
@@ -122,7 +132,7 @@ function Compare({scan, chosen}) {
         ${possible.map((each) => html`<option value=${each.id}>${each.label ?? "Scan"}, ${moment(each.created_at)}</option>`)}
       </select></label>`}
     ${rows.length > 0 && html`<div class="wide"><table><thead><tr><th>Figure</th><th>This scan</th><th>The other</th><th>Difference</th></tr></thead>
-      <tbody>${rows.map(([name, mine, written, theirs]) => html`<tr><th scope="row">${name}</th><td>${mine === undefined ? "–" : written(mine)}</td>
-        <td>${theirs === undefined ? "–" : written(theirs)}</td><td>${mine === undefined || theirs === undefined ? "–" : `${theirs < mine ? "−" : "+"}${written(Math.abs(theirs - mine))}`}</td></tr>`)}</tbody></table></div>
+      <tbody>${rows.map(([name, mine, written, theirs]) => html`<tr><th scope="row">${name}</th><td>${mine === undefined ? "–" : written(mine, scan.unit)}</td>
+        <td>${theirs === undefined ? "–" : written(theirs, scan.unit)}</td><td>${mine === undefined || theirs === undefined ? "–" : `${theirs < mine ? "−" : "+"}${written(Math.abs(theirs - mine), scan.unit)}`}</td></tr>`)}</tbody></table></div>
       <p class="quiet">Each is shown where its own calibration puts it. The colours "Deviation" show how far this mesh is from the other one.</p>`}`;
 }

@@ -7,6 +7,7 @@ import {NameField, called, useName} from "./names.js";
 import {whyNot} from "./ready.js";
 import {ask, follow, once, useAction, useValue} from "./service.js";
 import {Action, JobBadge, Progress, Refusal, begun, count, length} from "./ui.js";
+import {FirstScan} from "./uncalibrated.js";
 import {Panel, Workspace} from "./workspace.js";
 
 const SHOWN = 8;
@@ -26,35 +27,37 @@ export function ScanScreen({rig, may}) {
   // The oldest that is not over holds the rig, whoever asked for it, and also after this page was loaded anew.
   const active = scans.filter((scan) => !over(scan)).at(-1);
   const patterned = {...(preset ? {preset} : {}), ...(sequence ? {patterns: {sequence}} : {})};
-  const [start, busy, refused] = useAction(async () => {
+  const [start, busy, refused] = useAction(async (uncalibrated) => {
     const exposing = exposures_s?.length > 1 ? {exposures_s} : exposures_s ? {exposure_s: exposures_s[0]} : {};
-    const body = {if_busy: "queue", ...patterned, ...exposing, ...(region ? {reconstruction: {region}} : {}), label: name.trim() || null};
+    const body = {if_busy: "queue", ...patterned, ...exposing, reconstruction: {...(region ? {region} : {}), ...(uncalibrated ? {uncalibrated} : {})}, label: name.trim() || null};
     const scan = await ask("POST", "/scan", {body, headers: once()});
     sessionStorage.setItem("asked", scan.id);
     used();
     await again();
   });
   const blocked = whyNot(rig, may);
+  const open = may("scan") && rig?.open && rig.calibrated === false;
   const presets = known?.presets.filter(({fault}) => !fault) ?? [];
   const stage = html`<${Live} rig=${rig} may=${may} exposure_s=${exposures_s?.[0]} told=${setFigures} />
     ${active && html`<div class="over middle"><${UnderWay} key=${active.id} scan=${active} changed=${again} may=${may} /></div>`}`;
   const last = scans.find((scan) => scan.triangles !== null);
   return html`<${Workspace} label="Live picture" stage=${stage} top=${html`
       ${last && html`<a class="action" href=${`#/scan/${last.id}`}>Last mesh</a>`}
-      <span class="alone"><${Action} kind="primary" busy=${busy} disabled=${Boolean(blocked)} onClick=${start}>Scan<//></span>`}>
+      <span class="alone"><${Action} kind="primary" busy=${busy} disabled=${Boolean(blocked)} onClick=${() => start()}>Scan<//></span>`}>
     <section aria-label="Scan" class="head">
       <h2>New scan</h2>
       ${may("scan") && html`<${NameField} name=${name} change=${setName} entered=${() => blocked || start()} />`}
-      <${Action} kind="primary large" busy=${busy} disabled=${Boolean(blocked)} aria-describedby=${blocked && "why-not"} onClick=${start}>Scan<//>
-      ${blocked && html`<p id="why-not" class=${may("scan") ? "warning" : "quiet"}>${blocked.words} ${blocked.help && html`<a href=${blocked.help[0]}>${blocked.help[1]}</a>`}</p>`}
+      <${Action} kind="primary large" busy=${busy} disabled=${Boolean(blocked)} aria-describedby=${blocked && "why-not"} onClick=${() => start()}>Scan<//>
+      ${blocked && html`<p id="why-not" class=${may("scan") ? "warning" : "quiet"}>${blocked.words} ${blocked.help && html`<a href=${blocked.help[0]}>${blocked.help[1]}</a>`}${open && " Or scan without a calibration, below."}</p>`}
       ${rig?.error && html`<p class="warning">${rig.error} The next scan tries to open the rig again.</p>`}
       <${Refusal} problem=${refused} />
-      ${!active && scans[0]?.error && html`<${Refusal} problem=${{document: {title: "The last scan failed"}, message: scans[0].error.detail}} />`}
+      ${!active && scans[0]?.error && html`<${Refusal} problem=${{document: {title: "The last scan failed"}, message: scans[0].error.detail}}><a href=${`#/scan/${scans[0].id}`}>What to do now</a><//>`}
       ${may("scan") && html`<div class="row numbers">${known && html`<label>Preset <select value=${preset} onChange=${(event) => setPreset(event.target.value)}>
         <option value="">Rig default</option>${presets.map(({name, description}) => html`<option value=${name}>${begun(name)}${description ? `: ${description}` : ""}</option>`)}</select></label>`}
       <label>Patterns <select value=${sequence} onChange=${(event) => setSequence(event.target.value)}>
         <option value="">${preset ? "Preset's, or rig default" : "Rig default"}</option>${Object.entries(SEQUENCES).map(([name, words]) => html`<option value=${name}>${words}</option>`)}</select></label></div>`}
     </section>
+    ${open && html`<${Panel} name="Without a calibration"><${FirstScan} rig=${rig} start=${start} busy=${busy} blocked=${whyNot({...rig, calibrated: true}, may)} /><//>`}
     ${may("scan") && rig?.cameras.length > 0 && html`<${Panel} name="Exposure and focus"><${Exposure} rig=${rig} figures=${figures} exposures_s=${exposures_s} setExposures=${setExposures} request=${patterned} robust=${sequence ? null : () => setSequence("robust")} /><//>`}
     ${may("scan") && html`<${Limits} typed=${typed} region=${region} change=${change} others=${preset ? null : rig?.scan_defaults?.region} preset=${preset} />`}
     <section aria-label="Recent scans">
@@ -93,7 +96,7 @@ function Card({scan}) {
   return html`<li><a class="card" href=${`#/scan/${scan.id}`}>
     ${picture ? html`<img class="alone" src=${picture} alt="" loading="lazy" width="320" height="240" />` : html`<span class="none" aria-hidden="true">No picture</span>`}
     <span class="between"><span class="name">${called(scan)}</span><${JobBadge} state=${scan.state} /></span>
-    ${scan.triangles !== null && html`<span class="quiet">${count(scan.triangles)} triangles, σ ${length(scan.sigma_mm)}</span>`}
+    ${scan.triangles !== null && html`<span class="quiet">${count(scan.triangles)} triangles, σ ${length(scan.sigma_mm, scan.unit)}</span>`}
     ${scan.error && html`<span class="quiet clip">${scan.error.detail}</span>`}
   </a></li>`;
 }

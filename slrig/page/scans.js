@@ -195,7 +195,7 @@ function Card({scan, chosen, toggle}) {
     <a class="card" data-id=${scan.id} href=${`#/scan/${scan.id}`}>
       ${picture ? html`<img src=${picture} alt="" loading="lazy" width="320" height="240" />` : html`<span class="none" aria-hidden="true">No picture</span>`}
       <span class="between"><span class="name">${scan.label ?? time}</span>${scan.state !== "succeeded" && html`<${JobBadge} state=${scan.state} />`}</span>
-      <span class="quiet">${[scan.label ? time : null, scan.triangles === null ? null : `${count(scan.triangles)} triangles, σ ${length(scan.sigma_mm)}`, scan.preset, scan.pinned ? "pinned" : null].filter(Boolean).join(" · ")}</span>
+      <span class="quiet">${[scan.label ? time : null, scan.triangles === null ? null : `${count(scan.triangles)} triangles, σ ${length(scan.sigma_mm, scan.unit)}`, scan.preset, scan.pinned ? "pinned" : null].filter(Boolean).join(" · ")}</span>
       ${scan.error && html`<span class="quiet clip">${scan.error.detail}</span>`}
     </a></li>`;
 }

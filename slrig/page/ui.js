@@ -16,8 +16,8 @@ function inUnit(value, units, options) {
   return `${number(value / size, options)}\u00a0${unit}`;
 }
 
-/** Millimetres in the unit that reads best. */
-export const length = (mm) => (mm === 0 ? "0\u00a0mm" : inUnit(mm, [["µm", 1e-3, 0.1], ["mm", 1, Infinity]], {digits: Math.abs(mm) < 0.1 ? 3 : 4}));
+/** Millimetres in the unit that reads best; lengths in another `unit` as they are. */
+export const length = (mm, unit = "mm") => (unit !== "mm" ? inUnit(mm, [[unit, 1, Infinity]]) : mm === 0 ? "0\u00a0mm" : inUnit(mm, [["µm", 1e-3, 0.1], ["mm", 1, Infinity]], {digits: Math.abs(mm) < 0.1 ? 3 : 4}));
 /** Seconds in the unit that reads best. */
 export const duration = (s) => inUnit(s, [["µs", 1e-6, 1e-3], ["ms", 1e-3, 1], ["s", 1, 120], ["min", 60, 7200], ["h", 3600, 172800], ["days", 86400, Infinity]], {digits: s < 120 ? 3 : 2});
 export const bytes = (amount) => inUnit(amount, [["kB", 1e3, 1e6], ["MB", 1e6, 1e9], ["GB", 1e9, 1e12], ["TB", 1e12, Infinity]], {digits: 2});

@@ -12,7 +12,7 @@ from uuid import UUID, uuid4
 from pydantic import TypeAdapter
 
 from slrig.disk import storage_errors
-from slrig.errors import JobNotFoundError, NotCalibratedError, setting
+from slrig.errors import ConfigError, JobNotFoundError, NotCalibratedError, setting
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.job import Job, JobRun, Outcome, Recording
 from slrig.jobs.records import JobKind, JobRecord, utc_now
@@ -20,7 +20,7 @@ from slrig.model import Region
 from slrig.rig.session import RigSession
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.artefacts import MESH, REPORT, report_summary
-from slrig.scan.plan import ScanPlan, check_plan, series_of
+from slrig.scan.plan import RigGuess, ScanPlan, check_plan, series_of
 
 if TYPE_CHECKING:
     # The worker, which loads this for its first scan, has no database.
@@ -149,6 +149,18 @@ def scans_of(plan: ScanPlan, *, repeat: int = 1, every_s: float = 0.0) -> list[S
     if repeat == 1:
         return [ScanJob(plan)]
     return [ScanJob(each) for each in series_of(plan, uuid4(), count=repeat, every_s=every_s, begins_at=utc_now())]
+
+
+def with_guess(record: JobRecord, guess: RigGuess) -> ScanJob:
+    """A scan of a rig without a calibration, by another guess. Raises ConfigError: the rig was calibrated."""
+    plan = ScanJob.from_plan(record).plan
+    if plan.reconstruction.uncalibrated is None:
+        message = (
+            f"{setting('uncalibrated')}: expected a scan that was made without a calibration, found one that used the "
+            "rig's; leave it out, or scan again with it"
+        )
+        raise ConfigError(message)
+    return ScanJob(replace(plan, reconstruction=replace(plan.reconstruction, uncalibrated=guess)))
 
 
 def series(store: JobStore, series_id: UUID) -> Sequence[JobRecord]:

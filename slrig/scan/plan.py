@@ -170,6 +170,11 @@ class RigGuess:
                 raise ConfigError(message)
 
 
+def length_unit(guess: RigGuess | None) -> str:
+    """Unit of lengths of a scan. guess : of a rig without a calibration."""
+    return "mm" if guess is None or guess.baseline_mm is not None else "% of baseline"
+
+
 @dataclass(frozen=True, slots=True)
 class ReconstructionPlan:
     """How frames become a mesh.

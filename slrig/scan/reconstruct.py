@@ -128,7 +128,7 @@ from slrig.scan.pictures import (
     rejection_picture,
     rejection_size,
 )
-from slrig.scan.plan import ReconstructionPlan
+from slrig.scan.plan import ReconstructionPlan, length_unit
 from slrig.scan.preparation import prepare_kernels
 from slrig.scan.report import (
     Stopwatch,
@@ -141,7 +141,6 @@ from slrig.scan.report import (
     with_seconds,
 )
 from slrig.scan.stream import CameraResult, LiveScan, marked, within
-from slrig.scan.uncalibrated import length_unit
 
 _PICTURE_PX = 480
 """Wide enough for a share, and a tenth of the work at full size."""

@@ -13,7 +13,7 @@ from slrig.calibration import device_covariance, device_title, scale_mode
 from slrig.errors import SolveRefusedError, setting
 from slrig.model import Calibration, Capture, SolveRecord
 from slrig.reconstruction import DeviceGuess, PixelPairs, SelfCalibration, guessed_calibration, self_calibrate
-from slrig.scan.plan import RigGuess
+from slrig.scan.plan import RigGuess, length_unit
 from slrig.scan.stream import SecondAxisResult
 
 UNITS_PER_BASELINE = 100.0
@@ -109,11 +109,6 @@ def calibrated_by_scan(
         f"({setting('baseline_mm')}) for millimetres. "
     )
     return ScanCalibration(calibration, report, (words + "Calibrate with a board for less",))
-
-
-def length_unit(guess: RigGuess | None) -> str:
-    """Unit of lengths of a scan, for pictures. guess : of a rig without a calibration."""
-    return "mm" if guess is None or guess.baseline_mm is not None else "% of baseline"
 
 
 def pairs_of_both_axes(folder: Path, seconds: Mapping[str, SecondAxisResult | None]) -> dict[str, PixelPairs]:

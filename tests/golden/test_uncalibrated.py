@@ -20,9 +20,8 @@ from slrig.reconstruction.self_calibration import similarity_rms, triangulate
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.artefacts import decode_mesh_ply
 from slrig.scan.measured import refine_by_scans
-from slrig.scan.plan import ReconstructionPlan, RigGuess, ScanPlan
+from slrig.scan.plan import ReconstructionPlan, RigGuess, ScanPlan, length_unit
 from slrig.scan.reconstruct import reconstruct_bundle
-from slrig.scan.uncalibrated import length_unit
 
 RIG = """
 name = "wide"

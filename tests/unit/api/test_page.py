@@ -100,7 +100,8 @@ def test_the_page_is_small() -> None:
 
 WRITTEN = {
     "length(0.0123)": "12.3 µm", "length(-143.25)": "−143.3 mm", "length(1234.5)": "1 235 mm",
-    "length(null)": "not known", "length(0)": "0 mm", "duration(0.012)": "12 ms", "duration(95.2)": "95.2 s",
+    "length(null)": "not known", "length(0)": "0 mm", "length(31.234, '% of baseline')": "31.2 % of baseline",
+    "duration(0.012)": "12 ms", "duration(95.2)": "95.2 s",
     "duration(259200)": "3 days",
     "bytes(5.25e9)": "5.3 GB", "count(1234567)": "1 234 567", "percent(0)": "0 %", "percent(3.7e-5)": "< 0.01 %",
     "percent(0.9998)": "> 99.9 %", "percent(0.12345)": "12.3 %", "number(-1e-5, {decimals: 2})": "0.00",

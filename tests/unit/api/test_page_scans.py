@@ -71,3 +71,16 @@ def test_files_stand_in_groups_by_what_they_are_for() -> None:
         ["Raw", [["bundle.zip", True]]],
         ["More", [["causes-left.png", False], ["coarse.glb", True], ["x.new", False]]],
     ]
+
+
+def test_what_is_typed_of_devices_becomes_a_guess_and_back() -> None:
+    typed = 'by: "lens", cameras: {left: {lens: "8", pixel: "4"}, right: {lens: "8"}}, throwRatio: "1.2", throwOff: "5"'
+    guess = {"focal_px": {"left": 2000}, "throw_ratio": 1.2, "throw_sigma": 0.05}
+    assert told("uncalibrated.js", f'page.guessed({{{typed}}}, ["left", "right"])') == guess
+    assert told("uncalibrated.js", f'page.guessed(page.typedOf({json.dumps(guess)}), ["left"])') == guess
+
+
+def test_an_error_of_shape_is_allowed_where_that_helps() -> None:
+    stated = "the scan determines the shape to {}% of its size only, and 0.15% are allowed: {}, or allow a larger error"
+    refusals = [stated.format("2.77", "too little depth"), stated.format("0.20", "…")[:60], "the scene is flat"]
+    assert told("uncalibrated.js", f"{json.dumps(refusals)}.map(page.allowable)") == [0.0278, None, None]

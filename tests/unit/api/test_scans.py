@@ -270,8 +270,8 @@ NOT_READY = (409, "/problems/artefact-not-ready")
 DAMAGED = (410, "/problems/damaged")
 
 
-def finished(client: TestClient) -> dict[str, Any]:
-    scan = ended(client, client.post("/scan").json()["id"])
+def finished(client: TestClient, **request: Any) -> dict[str, Any]:
+    scan = ended(client, client.post("/scan", json=request).json()["id"])
     assert scan["state"] == "succeeded"
     return scan
 
@@ -339,6 +339,25 @@ def test_what_cannot_be_reconstructed_again_says_why(client: TestClient, served:
     assert refusal(client, "GET", f"/scan/{runs}/bundle.zip") == DAMAGED
     assert sorted(place_of(served, runs).iterdir()) == before
     assert refusal(client, "POST", f"/scan/{uuid4()}/reconstruct")[0] == 404
+
+
+def test_a_scan_without_a_calibration_is_made_again_by_other_guesses(client: TestClient, served: ServedBench) -> None:
+    scan = finished(client, reconstruction={"uncalibrated": {"throw_ratio": 1.2}})
+    assert scan["unit"] == "% of baseline"
+    better = {"baseline_mm": 180, "most_error": 0.01}
+    again = client.post(f"/scan/{scan['id']}/reconstruct", json={"uncalibrated": better})
+    assert again.status_code == 202, again.text
+    remade = ended(client, scan["id"])
+    kept = read_record(place_of(served, scan["id"]))
+    assert kept is not None
+    assert (remade["state"], kept.plan) == ("succeeded", remade["plan"])
+    asked = remade["plan"]["reconstruction"]["uncalibrated"]
+    assert (asked["baseline_mm"], asked["most_error"], asked["throw_ratio"], remade["unit"]) == (180, 0.01, None, "mm")
+    assert [each["unit"] for each in client.get("/scan").json()["scans"]] == ["mm"]
+    # By the rig's own calibration there is nothing to guess.
+    scan = finished(client)
+    refused = refusal(client, "POST", f"/scan/{scan['id']}/reconstruct", json={"uncalibrated": {}})
+    assert refused == (422, "/problems/config")
 
 
 @pytest.mark.slow
