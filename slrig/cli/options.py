@@ -266,6 +266,9 @@ class GuessOptions:
     baseline_mm: Annotated[
         float | None, typer.Option(help="From the first camera's lens to the projector's. Default: the unit of length.")
     ] = None
+    baseline_sigma: Annotated[
+        float | None, typer.Option(help="By how much that may be wrong, relative. Default 0.01.")
+    ] = None
     most_error: Annotated[
         float | None, typer.Option(help="Refuse a shape that is known less well, over its size. Default 0.0015.")
     ] = None

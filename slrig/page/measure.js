@@ -47,6 +47,15 @@ const times = (matrix, vector) => matrix.map((row) => row.reduce((sum, each, at)
 /** The distance of two points {pointMm, sigmaMm}; σ as if each erred along the line. */
 export const distance = (a, b) => ({valueMm: apart(a.pointMm, b.pointMm), sigmaMm: Math.hypot(a.sigmaMm, b.sigmaMm)});
 
+/**
+ * What the true length of a measured distance says of the scale: the factor of all lengths, and its relative σ, by the two points, by where they were clicked
+ * (`clickedMm` of each) and by that of the length itself.
+ */
+export function scaleBy({valueMm, sigmaMm, clickedMm}, trueMm, trueSigmaMm = 0) {
+  const sigma = Math.hypot(...[sigmaMm, ...clickedMm].map((mm) => Number.isFinite(mm) ? mm / valueMm : 0), trueSigmaMm / trueMm);
+  return {factor: trueMm / valueMm, sigma: Math.min(Math.max(sigma, 1e-5), 1)};
+}
+
 /** The vertices within a ball, in mm, and their σ: {points: [[x, y, z]], sigmas}. σ is NaN where it is not known. */
 export function patch(mesh, centreMm, radiusMm) {
   const {array, width} = mesh.attributes.POSITION;

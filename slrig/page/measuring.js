@@ -1,7 +1,8 @@
 // Measuring in the view: what is chosen, what is clicked, and the figures at the line and in a table.
 import {html, useState} from "./vendor/preact-htm.js";
-import {distance, fit, patch, pointToPlane, radius, section} from "./measure.js";
-import {Action, Choice, Field, count, length, number} from "./ui.js";
+import {distance, fit, patch, pointToPlane, radius, scaleBy, section} from "./measure.js";
+import {useAction} from "./service.js";
+import {Action, Choice, Field, Refusal, count, length, number} from "./ui.js";
 
 const KINDS = [["distance", "Distance"], ["plane", "Point to plane"], ["sphere", "Sphere"], ["cylinder", "Cylinder"], ["section", "Section"]];
 const TOLD = Object.fromEntries(KINDS);
@@ -33,8 +34,10 @@ export function useMeasuring(view, unit = "mm") {
     setPicks([]);
     setRefused(null);
   };
-  const take = (hit) => {
-    if (!hit) return;
+  const take = (seen) => {
+    if (!seen) return;
+    // A click is right to a pixel.
+    const hit = {...seen, clickedMm: 1 / view.pxPerMm(seen.pointMm)};
     const pick = FITTED.includes(kind) && picks.length === 0 ? {...hit, patchMm, form: fit(kind, patch(hit.mesh, hit.pointMm, patchMm))} : hit;
     if (pick.form === null) {
       setRefused(`Too little surface within ${length(patchMm, unit)} of that point to fit a ${kind}. Choose a larger patch, or click elsewhere.`);
@@ -121,12 +124,29 @@ function anchorOf(kind, picks, found) {
   return line.length > 2 ? line[middle] : line[0].map((mm, axis) => (mm + line[1][axis]) / 2);
 }
 
-export function Measured({measuring: {done, unit, clear}}) {
+/** `rescale` makes the scan again by a known length: by a factor and its relative σ; null where that cannot be. */
+export function Measured({measuring: {done, unit, clear}, rescale}) {
   const at = ({pointMm}) => `(${pointMm.map((mm) => number(mm, {decimals: 3})).join(", ")})`;
   return html`<table class="measured"><thead><tr><th>What</th><th>Value</th><th>σ</th></tr></thead>
       <tbody>${done.map(({kind, picks, valueMm, sigmaMm}) => html`<tr><td>${TOLD[kind]}</td><td>${digits(valueMm, sigmaMm, unit)}</td><td>${length(sigmaMm, unit)}</td></tr>
-        <tr class="quiet"><td colspan="3">${picks.map(at).join(" to ")} ${unit}${picks[0].form && `; fit of ${count(picks[0].form.points)} points, rms ${length(picks[0].form.rmsMm, unit)}`}</td></tr>`)}</tbody></table>
+        <tr class="quiet"><td colspan="3">${picks.map(at).join(" to ")} ${unit}${picks[0].form && `; fit of ${count(picks[0].form.points)} points, rms ${length(picks[0].form.rmsMm, unit)}`}
+          ${rescale && kind === "distance" && html`<${KnownLength} found=${{valueMm, sigmaMm, clickedMm: picks.map(({clickedMm}) => clickedMm)}} rescale=${rescale} />`}</td></tr>`)}</tbody></table>
     <p class="quiet">σ comes from that of the mesh: noise, and the calibration's error where that is stated. A fitted patch counts as 16 independent points, because neighbours err alike.
       Not in it: where you clicked, and what all points share, such as a wrong scale.</p>
     <${Action} onClick=${clear}>Clear<//>`;
+}
+
+/** Says how long a measured distance is in truth. */
+function KnownLength({found, rescale}) {
+  const [trueMm, setTrue] = useState("");
+  const [trueSigmaMm, setSigma] = useState("");
+  const [compute, busy, problem] = useAction(() => rescale(scaleBy(found, Number(trueMm), Number(trueSigmaMm))));
+  const submit = (event) => {
+    event.preventDefault();
+    compute();
+  };
+  return html`<details><summary>This length is known</summary><form onSubmit=${submit}>
+    <div class="row numbers"><${Field} label="True length, mm" value=${trueMm} change=${setTrue} required /><${Field} label="Right within, mm" value=${trueSigmaMm} change=${setSigma} placeholder="0" /></div>
+    <button class="action" type="submit" aria-busy=${busy} disabled=${busy || !(trueMm > 0)}>Compute again with this length</button></form>
+    <${Refusal} problem=${problem} /></details>`;
 }

@@ -32,9 +32,9 @@ if (/^#\/(scan|models)\/./.test(location.hash)) loadDrawing().catch(() => {});
 /**
  * `scan`: a scan, or a model of several, which is `merged` and has no stripes. `other`: a scan shown in the same view, or null. `report` and `calibration` may come later.
  * `again` takes the box of what is seen, or is null. `over` stands over the middle of the stage. `pointed`: {mm}, a point that is pointed at, or {fromMm, along}, the ray
- * of a picture's pixel; `point` takes one. `head` and `children` stand beside the stage.
+ * of a picture's pixel; `point` takes one. `rescale`: see `Measured`. `head` and `children` stand beside the stage.
  */
-export function Mesh({scan, other = null, report, calibration = null, again, over, pointed = null, point, head, children}) {
+export function Mesh({scan, other = null, report, calibration = null, again, over, pointed = null, point, rescale = null, head, children}) {
   const canvas = useRef();
   const [view, setView] = useState(null);
   const [styles, setStyles] = useState({});
@@ -122,7 +122,7 @@ export function Mesh({scan, other = null, report, calibration = null, again, ove
         chosen=${(value) => setShown(value.split(",").map((each) => each === "true"))} />`}
       ${again && html`<${Action} disabled=${!view} onClick=${() => again(view.seen())}>Limit the next scan to this view<//>`}`}
     </div>`;
-  const measured = measuring.done.length > 0 && html`<${Panel} key="measured" name="Measurements"><${Measured} measuring=${measuring} /><//>`;
+  const measured = measuring.done.length > 0 && html`<${Panel} key="measured" name="Measurements"><${Measured} measuring=${measuring} rescale=${rescale} /><//>`;
   return html`<${Workspace} label="Mesh" stage=${stage} top=${top} bottom=${bottom} keys=${keys}>${children && html`${head}${measured}${children}`}<//>
     ${!children && measured}`;
 }

@@ -7,7 +7,7 @@ import {Mesh, loadDrawing} from "./mesh.js";
 import {NameHeading} from "./names.js";
 import {ask, follow, once, useAction, useValue} from "./service.js";
 import {Action, Facts, JobBadge, Progress, Refusal, count, length, moment, percent} from "./ui.js";
-import {FoundCalibration, OtherGuesses} from "./uncalibrated.js";
+import {FoundCalibration, OtherGuesses, computeAgain, rescaled} from "./uncalibrated.js";
 import {Panel, Workspace} from "./workspace.js";
 import {html, useEffect, useRef, useState} from "./vendor/preact-htm.js";
 
@@ -56,9 +56,11 @@ function Result({scan, rig, again, may}) {
       <${Causes} camera=${name} told=${camera} causes=${report.causes} files=${files} device=${calibration?.cameras[name] ?? null} pointed=${pointed} point=${point} /><//>`)}
     ${over && hasMesh && html`<${Panel} name="Compare"><${Compare} scan=${scan} chosen=${setOther} /><//>`}
     <${Panel} name="Keep or delete">${may("scan") && html`<${Keeping} job=${scan} kind="scan" over=${over} again=${again} />`}<//>`;
+  const guess = may("scan") && over && files["bundle.zip"] && scan.plan?.reconstruction.uncalibrated;
+  const rescale = guess ? (scale) => computeAgain(scan, rescaled(guess, scale)).then(again) : null;
   if (hasMesh)
     return html`<${Mesh} key=${scan.id} scan=${scan} other=${other} report=${report} calibration=${calibration} again=${may("scan") ? limitToBox : null} over=${progress}
-      pointed=${pointed} point=${point} head=${head}>${panels}<//>`;
+      pointed=${pointed} point=${point} rescale=${rescale} head=${head}>${panels}<//>`;
   return html`<${Workspace} label="Mesh" stage=${html`<div class="over middle">${over ? html`<${Ended} scan=${scan} rig=${rig} again=${again} may=${may} />` : progress}</div>`}>${head}${panels}<//>`;
 }
 

@@ -4,6 +4,8 @@ import {ask, useAction} from "./service.js";
 import {Action, Choice, Facts, Field, Refusal, count, number, percent} from "./ui.js";
 
 const KEPT = "guess";
+/** How long one is where its length is not known: lengths are in hundredths of it. */
+const BASELINE = 100;
 const USUAL = {by: "px", cameras: {}, focalOff: "", throwRatio: "", throwOff: "", baseline: "", baselineOff: "", most: ""};
 const BY = [["px", "In pixels"], ["lens", "By lens and pixel size"]];
 
@@ -40,8 +42,11 @@ export function allowable(words) {
   return stated && (Math.round(100 * stated[1]) + 1) / 1e4;
 }
 
+/** A guess after a known length told the factor of all lengths and its relative σ: the baseline is as much longer, and in mm. */
+export const rescaled = (guess, {factor, sigma}) => ({...guess, baseline_mm: (guess.baseline_mm ?? BASELINE) * factor, baseline_sigma: sigma});
+
 /** Have a scan made again from its frames, by other guesses. */
-const again = (scan, guess) => ask("POST", `${scan.links.self}/reconstruct`, {body: {uncalibrated: guess}});
+export const computeAgain = (scan, guess) => ask("POST", `${scan.links.self}/reconstruct`, {body: {uncalibrated: guess}});
 
 /** What is known of the devices: fields that may all stay empty. */
 function Guesses({names, typed, change}) {
@@ -90,7 +95,7 @@ export function OtherGuesses({scan, rig, changed}) {
   const allowed = allowable(scan.error?.detail);
   const [typed, setTyped] = useState(() => typedOf(before));
   const names = [...new Set([...(rig?.cameras ?? []).map(({name}) => name), ...Object.keys(before.focal_px)])];
-  const [compute, busy, refused] = useAction((guess) => again(scan, guess).then(changed));
+  const [compute, busy, refused] = useAction((guess) => computeAgain(scan, guess).then(changed));
   const submit = (event) => {
     event.preventDefault();
     compute(guessed(typed, names));
@@ -108,7 +113,7 @@ export function FoundCalibration({scan, report, rig, may, changed}) {
   const {shape_error: error, shape_error_mm: errorLength, size_mm: size, unit, scale_sigma: scale, focal_changed: focal, pairs} = report.self_calibration;
   const inMm = unit === "mm";
   const [baseline, setBaseline] = useState("");
-  const [compute, busy, refused] = useAction(() => again(scan, {...scan.plan.reconstruction.uncalibrated, baseline_mm: Number(baseline)}).then(changed));
+  const [compute, busy, refused] = useAction(() => computeAgain(scan, {...scan.plan.reconstruction.uncalibrated, baseline_mm: Number(baseline)}).then(changed));
   const [use, using, unused] = useAction(async () => {
     const file = JSON.stringify(await ask("GET", scan.links.files["calibration.json"]));
     const label = `Found by scan${scan.label ? ` ${scan.label}` : ""}`.slice(0, 100);

@@ -53,15 +53,24 @@ def scan_without_a_calibration(page: Page) -> None:
     page.get_by_label("Refuse errors of shape above, %").fill("0.01")
     page.get_by_role("button", name="Scan without a calibration").click()
     page.get_by_role("link", name="What to do now").click(timeout=_SOLVED_MS)
-    page.get_by_text("the scene has too little depth").wait_for()
+    page.wait_for_url("**/#/scan/*-*")
+    page.get_by_role("alert").get_by_text("the scene has too little depth").wait_for()
     page.get_by_text("Say more of the devices").click()
     assert violations(page) == []
     page.get_by_role("button", name=re.compile(r"Allow 0\.\d+\s% and compute again")).click()
     page.get_by_text("hundredths of the distance from the first camera").wait_for(timeout=_SOLVED_MS)
     page.get_by_text(re.compile(r"0\.\d+\s% of its size: .* hundredths of the baseline")).wait_for()
     count(page.get_by_role("button", name="Use it as the rig's calibration"), 0)
-    page.get_by_label("First camera to projector, mm").fill("305")
-    page.get_by_role("button", name="Compute again in mm").click()
+    page.get_by_text(re.compile(r"^[\d\s]+ triangles\.$")).wait_for()
+    page.get_by_role("button", name="Measure").click()
+    for right in (0.4, 0.6):
+        box = page.get_by_role("application").bounding_box()
+        assert box is not None
+        page.get_by_role("application").click(position={"x": right * box["width"], "y": box["height"] / 2})
+    page.get_by_text("This length is known").click()
+    page.get_by_label("True length, mm").fill("110")
+    assert violations(page) == []
+    page.get_by_role("button", name="Compute again with this length").click()
     page.get_by_text("mm, by the distance that was stated").wait_for(timeout=_SOLVED_MS)
     page.get_by_text(re.compile(r"^[\d\s]+ triangles\.$")).wait_for()
     looks_as_kept(page, "result-uncalibrated")

@@ -84,3 +84,16 @@ def test_an_error_of_shape_is_allowed_where_that_helps() -> None:
     stated = "the scan determines the shape to {}% of its size only, and 0.15% are allowed: {}, or allow a larger error"
     refusals = [stated.format("2.77", "too little depth"), stated.format("0.20", "…")[:60], "the scene is flat"]
     assert told("uncalibrated.js", f"{json.dumps(refusals)}.map(page.allowable)") == [0.0278, None, None]
+
+
+def test_a_known_length_scales_the_baseline_by_what_it_is_known_to() -> None:
+    found = "{valueMm: 40, sigmaMm: 0.3, clickedMm: [0.2, 0.2]}"
+    scale = told("measure.js", f"page.scaleBy({found}, 100, 0.5)")
+    assert scale == {"factor": 2.5, "sigma": pytest.approx(((0.3**2 + 2 * 0.2**2) / 40**2 + 0.005**2) ** 0.5)}
+    guesses = "[{throw_ratio: 1.2, baseline_mm: null}, {baseline_mm: 200}]"
+    rescaled = "(each) => page.rescaled(each, {factor: 2.5, sigma: 0.01})"
+    first, second = told("uncalibrated.js", f"{guesses}.map({rescaled})")
+    assert first == {"throw_ratio": 1.2, "baseline_mm": 250, "baseline_sigma": 0.01}
+    assert second == {"baseline_mm": 500, "baseline_sigma": 0.01}
+    unknown = "{valueMm: 40, sigmaMm: NaN, clickedMm: [0, 0]}"
+    assert told("measure.js", f"page.scaleBy({unknown}, 100).sigma") == 1e-5
