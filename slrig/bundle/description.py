@@ -42,10 +42,11 @@ class ProjectorEntry(Strict):
 
 
 class CameraEntry(Strict):
-    """One camera: extent and bit depth of its frames."""
+    """One camera: extent and bit depth of its frames, and the focal length that imported pictures stated."""
 
     size_px: Extent
     bit_depth: Annotated[int, Field(ge=1, le=16)]
+    focal_px: Annotated[float, Field(gt=0)] | None = None
     compression_dn: Annotated[
         float,
         Field(ge=0, le=1000, description="written by earlier versions; now measured in the frames"),

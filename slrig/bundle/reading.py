@@ -45,6 +45,11 @@ class BundleFiles:
     folder: Path
     _description: Description
 
+    @property
+    def focal_px(self) -> dict[str, float]:
+        """Focal lengths that imported pictures of cameras state."""
+        return {name: each.focal_px for name, each in self._description.cameras.items() if each.focal_px is not None}
+
     def shots(self, order: Sequence[int], *, colour: bool = True) -> Iterator[Shot]:
         """Yield the frames with these indices of the outline, and read the next few on other threads.
 

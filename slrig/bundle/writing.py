@@ -39,6 +39,7 @@ class BundleWriter:
     The bundle grows in a hidden folder next to `folder`, which is renamed when the block ends without an error. Any
     error, in the block or on the disk, removes it: the folder is complete or absent. Only `keep` leaves the bundle of
     an aborted capture, with a statement of that. captured_at : start of the capture, with the offset from UTC.
+    focal_px : focal lengths that the pictures of cameras state.
     Raises BundleError: `folder` exists already, a camera's name cannot be a file's name, or no frame was added;
     StorageError: the disk refused.
     """
@@ -52,6 +53,7 @@ class BundleWriter:
         calibration: Calibration | None = None,
         *,
         captured_at: datetime | None = None,
+        focal_px: Mapping[str, float] | None = None,
     ) -> None:
         wrong = [name for name in cameras if not re.fullmatch(CAMERA_NAME, name) or name == PROJECTOR]
         if wrong:
@@ -68,6 +70,7 @@ class BundleWriter:
         self._lost: set[str] = set()
         self._calibration = calibration
         self._captured_at = captured_at
+        self._focal_px = dict(focal_px or {})
         self._slots: list[_FrameSlot] = []
         self._refused: list[RefusedEntry] = []
         self._count: Counter[str] = Counter()
@@ -166,6 +169,7 @@ class BundleWriter:
             "projector": {"size_px": _extent(self._projector)},
             "cameras": {
                 name: {"size_px": _extent(camera.size), "bit_depth": camera.bit_depth}
+                | ({"focal_px": self._focal_px[name]} if name in self._focal_px else {})
                 for name, camera in self._cameras.items()
                 if name not in self._lost
             },

@@ -24,6 +24,7 @@ from slrig.disk import storage_errors
 from slrig.errors import BundleError, PatternError
 from slrig.importers.calibrations import import_calibration
 from slrig.importers.coded_images import CodedImages
+from slrig.importers.exif import read_focal_px
 from slrig.importers.folders import UnderstoodFolder, group_by_prefix, groupings, list_subfolders, understand_folder
 from slrig.importers.images import (
     SourceImage,
@@ -138,7 +139,10 @@ def import_capture(
         calibration, images.calibration_notes = read.calibration, read.notes
         check_calibration(calibration, code.size, sizes, str(path))
     patterns = list(dict.fromkeys(pattern for files in images.cameras.values() for _, pattern in files))
-    with BundleWriter(output, code.size, patterns, formats, calibration) as writer:
+    stated = {name: read_focal_px(files[0][0].path, formats[name].size) for name, files in images.cameras.items()}
+    focal_px = {name: round(px, 1) for name, px in stated.items() if px is not None}
+    images.notes += [f"{name}: its pictures state a focal length of {px:.0f} px" for name, px in focal_px.items()]
+    with BundleWriter(output, code.size, patterns, formats, calibration, focal_px=focal_px) as writer:
         for name, files in images.cameras.items():
             images.faults += _write_camera(writer, name, files, formats[name], patterns)
             white = next((image for image, pattern in files if isinstance(pattern, White)), None)

@@ -557,10 +557,13 @@ def measured(
     if uncalibrated is None:
         walked = walk(live, axis=axis)
     else:
-        guess = guessed_rig(open_bundle(folder).outline, uncalibrated)
+        files = open_bundle(folder)
+        stated_px = {name: px for name, px in files.focal_px.items() if name not in uncalibrated.focal_px}
+        guess = guessed_rig(files.outline, uncalibrated, stated_px)
         walked = walk(None, axis=axis, devices=guess)
         entered("calibrate by scan", 0.58, "")
-        own = calibrated_by_scan(folder, guess, uncalibrated, {each.name: each.second for each in walked.seen})
+        seconds = {each.name: each.second for each in walked.seen}
+        own = calibrated_by_scan(folder, guess, uncalibrated, seconds, stated_px)
         seen = [replace(each, device=own.calibration.cameras[each.name]) for each in walked.seen]
         walked = replace(walked, devices=own.calibration, seen=seen)
         walked.sections["self_calibration"] = own.report

@@ -23,6 +23,8 @@ _CONTRADICTED = 3.0  # distances from the epipolar lines of before, over their s
 
 _USUAL_RATIO, _USUAL_SIGMA = 1.4, 0.25
 """Focal length over the width of the image, and its relative deviation, where nothing is known."""
+_STATED_SIGMA = 0.03
+"""Relative deviation of what pictures state: names of lenses are round, and 35 mm equivalents are whole millimetres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +36,9 @@ class ScanCalibration:
     notes: tuple[str, ...]
 
 
-def guessed_rig(outline: Capture, guess: RigGuess) -> Calibration:
-    """Devices as guessed, side by side, with the covariance of their lenses.
-    Raises SolveRefusedError: a focal length is of a camera that is not there.
+def guessed_rig(outline: Capture, guess: RigGuess, stated_px: Mapping[str, float]) -> Calibration:
+    """Devices as guessed, side by side, with the covariance of their lenses. stated_px : focal lengths that pictures
+    state, of cameras for which the guess has none. Raises SolveRefusedError: a guess is of a camera that is not there.
     """
     unknown = sorted(set(guess.focal_px) - set(outline.cameras))
     if unknown:
@@ -48,8 +50,8 @@ def guessed_rig(outline: Capture, guess: RigGuess) -> Calibration:
     cameras = {
         name: DeviceGuess(
             form.size,
-            guess.focal_px.get(name, _USUAL_RATIO * form.size.width_px),
-            guess.focal_sigma if name in guess.focal_px else _USUAL_SIGMA,
+            guess.focal_px.get(name, stated_px.get(name, _USUAL_RATIO * form.size.width_px)),
+            guess.focal_sigma if name in guess.focal_px else _STATED_SIGMA if name in stated_px else _USUAL_SIGMA,
         )
         for name, form in outline.cameras.items()
     }
@@ -70,9 +72,14 @@ def guessed_rig(outline: Capture, guess: RigGuess) -> Calibration:
 
 
 def calibrated_by_scan(
-    folder: Path, guess: Calibration, known: RigGuess, seconds: Mapping[str, SecondAxisResult | None]
+    folder: Path,
+    guess: Calibration,
+    known: RigGuess,
+    seconds: Mapping[str, SecondAxisResult | None],
+    stated_px: Mapping[str, float],
 ) -> ScanCalibration:
     """The calibration that one scan by columns and rows gives. seconds : what the second axis shows of each camera.
+    stated_px : as of `guessed_rig`.
 
     Raises SolveRefusedError: one axis was played, or the scan leaves the shape open.
     """
@@ -108,7 +115,12 @@ def calibrated_by_scan(
         else "All lengths are in hundredths of the distance from the first camera to the projector: state it "
         f"({setting('baseline_mm')}) for millimetres. "
     )
-    return ScanCalibration(calibration, report, (words + "Calibrate with a board for less",))
+    sources = (
+        f"the focal length of camera '{name}' began from what its pictures state (EXIF): {px:.0f} px, right to "
+        f"{_STATED_SIGMA:.0%}. Where that is wrong, state it ({setting('focal_px')})"
+        for name, px in stated_px.items()
+    )
+    return ScanCalibration(calibration, report, (words + "Calibrate with a board for less", *sources))
 
 
 def pairs_of_both_axes(folder: Path, seconds: Mapping[str, SecondAxisResult | None]) -> dict[str, PixelPairs]:

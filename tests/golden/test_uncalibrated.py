@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -54,21 +55,23 @@ BASELINE_MM = float(np.linalg.norm([70.0, -8.0, -15.0]))
 
 
 def guess(**others: float) -> RigGuess:
-    """Focal lengths 3 % wrong, either way."""
-    return RigGuess(
-        focal_px={"left": 620 * 1.03}, focal_sigma=0.03, throw_ratio=700 / 512 * 0.97, throw_sigma=0.03, **others
-    )
+    """The throw ratio 3 % wrong. The camera's focal length is what its pictures state."""
+    return RigGuess(throw_ratio=700 / 512 * 0.97, throw_sigma=0.03, **others)
 
 
 @pytest.fixture(scope="module")
 def scanned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Calibration]:
-    """A bundle without a calibration, and that of the renderer."""
+    """A bundle without a calibration, whose pictures state a focal length 3 % wrong; and that of the renderer."""
     folder = tmp_path_factory.mktemp("uncalibrated")
     (folder / "rig.toml").write_text(RIG.format(scene=(EXAMPLES / "scenes" / "demo.toml").as_posix()))
     plan = ScanPlan(reconstruction=ReconstructionPlan(uncalibrated=RigGuess()))
     with open_rig(read_rig(folder / "rig.toml")) as rig:
         assert rig.calibration is not None
         capture_frames(replace(rig, calibration=None), plan, folder / "bundle").finish()
+        description = folder / "bundle" / "bundle.json"
+        told = json.loads(description.read_text())
+        told["cameras"]["left"]["focal_px"] = 620 * 1.03
+        description.write_text(json.dumps(told))
         return folder / "bundle", rig.calibration
 
 
@@ -92,6 +95,8 @@ def test_a_first_scan_gives_a_shape_that_is_as_right_as_it_states(
     assert stated["unit"] == "mm"
     assert abs(float(np.linalg.norm(found.projector.centre_mm)) - BASELINE_MM) < 1e-3
     assert "calibrated by this scan alone" in report["notes"][0]
+    assert "began from what its pictures state (EXIF): 639 px, right to 3%" in report["notes"][1]
+    assert abs(stated["focal_changed"]["left"] - (1 / 1.03 - 1)) < 0.03
     assert report["calibration"]["id"] == found.solve_id
     assert "truth" not in report
 
