@@ -48,6 +48,7 @@ from slrig.reconstruction.frames import (
 )
 from slrig.reconstruction.fusion import ExposureUse, FusedFrames, exposure_use, fuse_colour, fuse_exposures
 from slrig.reconstruction.identification import StripeEnsemble
+from slrig.reconstruction.image_part import ImagePart, part_of_region
 from slrig.reconstruction.merging import (
     MergedCurves,
     merge_curves,
@@ -119,6 +120,7 @@ __all__ = [
     "FusedFrames",
     "Illumination",
     "Image",
+    "ImagePart",
     "MergedCurves",
     "PairRedundancy",
     "PixelPairs",
@@ -166,6 +168,7 @@ __all__ = [
     "noise_px",
     "optical_depths_mm",
     "pack_device",
+    "part_of_region",
     "pixel_rays",
     "position_map",
     "project",

@@ -10,15 +10,13 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.capture import EvidenceSummary
-from slrig.errors import ConfigError, PatternError
+from slrig.errors import PatternError
 from slrig.model import (
     Axis,
     Black,
@@ -81,7 +79,7 @@ from slrig.reconstruction import (
     linearise,
     mean_image,
     optical_depths_mm,
-    pixel_rays,
+    part_of_region,
     project,
     reference_repeats,
     select_points,
@@ -92,15 +90,6 @@ from slrig.scan.plan import chosen_axis
 from slrig.scan.report import Stopwatch
 
 Sample = TypeVar("Sample", bound=np.generic)
-
-_BESIDE_PX = 16
-"""About what is asked for: on it the points at its border depend."""
-_LEAST_PX = 320
-"""Of a part's sides, if the camera has as many: the noise of the camera is told by its pixels."""
-_STEPS = 17
-"""Points on each edge of a box by which its outline is known: through a lens its edges bend by less between two."""
-_CORNER_BITS = 4
-"""Of a pixel, of a polygon's corners when it is drawn: sixteenths."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,31 +141,14 @@ def frame_part(
     ConfigError
         The region names another extent than the camera's, or nothing of it is in the camera's image.
     """
-    drawn = _drawn(region, name, form.size)
-    outline = _outline(region, device, form.size)
-    pixels = outline if drawn is None else outline & drawn
-    if not pixels.any():
-        message = (
-            f"region: nothing of it is in the image of camera '{name}'. Coordinates of a box are those of the mesh, in "
-            "mm: look at the mesh of a scan without a region."
-        )
-        raise ConfigError(message)
-    rows, columns = (
-        _about(np.asarray(pixels.any(axis=across)), extent)
-        for across, extent in zip((1, 0), form.size.shape, strict=True)
-    )
-    exact = pixels[rows, columns]
+    part = part_of_region(region, name, form.size, device)
     lowest = highest = None
-    if region.box_mm is not None or region.depth_mm is not None:
-        y, x = np.mgrid[rows, columns].astype(np.float64)
-        directions = pixel_rays(device, np.stack([x.ravel(), y.ravel()], axis=1))
-        near, far = _stretch(region, device, directions)
-        exact &= (near < far).reshape(exact.shape)
-        if projector is not None:
-            ends = _light(near, far, directions, device, projector, axis)
-            lowest, highest = (each.reshape(exact.shape) for each in ends)
-    asked = RegionMask(exact, lowest, highest, region.min_contrast or 0.0)
-    return FramePart(rows, columns, asked, form)
+    if part.depths_mm is not None and projector is not None:
+        near, far = (each.ravel() for each in part.depths_mm)
+        ends = _light(near, far, part.rays(device), device, projector, axis)
+        lowest, highest = (each.reshape(part.asked.shape) for each in ends)
+    asked = RegionMask(part.asked, lowest, highest, region.min_contrast or 0.0)
+    return FramePart(part.rows, part.columns, asked, form)
 
 
 def limited(
@@ -216,74 +188,6 @@ def marked(refusal: NDArray[np.uint8], pixels_px: FloatArray, kept: NDArray[np.b
     out[rows[~kept], columns[~kept]] = Refusal.OUTSIDE_REGION
     out[rows[kept], columns[kept]] = refusal[rows[kept], columns[kept]]
     return out
-
-
-def _drawn(region: Region, name: str, size: Size) -> NDArray[np.bool_] | None:
-    """(H, W) bool: where polygon and mask let a camera look; None where there are none."""
-    drawn = np.full(size.shape, 255, dtype=np.uint8)
-    if name in region.masks:
-        mask = cv2.imdecode(np.frombuffer(region.mask_png(name), dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
-        if mask is None or mask.shape != size.shape:
-            message = f"region.masks.{name}: the PNG cannot be read; save it again"
-            raise ConfigError(message)
-        drawn = np.asarray(mask, dtype=np.uint8)
-    if name in region.polygons_px:
-        corners = np.rint(np.array(region.polygons_px[name]) * 2**_CORNER_BITS).astype(np.int32)
-        inside: Pixels = np.zeros(size.shape, dtype=np.uint8)
-        cv2.fillPoly(inside, [corners], 255, shift=_CORNER_BITS)
-        drawn = np.minimum(drawn, inside)
-    return None if name not in region.cameras else drawn > 0
-
-
-def _outline(region: Region, device: Pinhole, size: Size) -> NDArray[np.bool_]:
-    """(H, W) bool: a rectangle that holds the image of the region's box; all of the image where no box says less."""
-    seen = np.zeros(size.shape, dtype=np.bool_)
-    first, last = np.zeros(2), np.array([size.width_px, size.height_px], dtype=np.float64)
-    if region.box_mm is not None:
-        pixels = project(device, _edges(region.box_mm))
-        if np.isfinite(pixels).all():  # a box that reaches behind the camera has no outline
-            first = np.clip(np.floor(pixels.min(axis=0)) - _BESIDE_PX, 0, last)
-            last = np.clip(np.ceil(pixels.max(axis=0)) + 1 + _BESIDE_PX, 0, last)
-    (left, top), (right, bottom) = first.astype(int), last.astype(int)
-    seen[top:bottom, left:right] = True
-    return seen
-
-
-def _edges(box_mm: tuple[tuple[float, float, float], tuple[float, float, float]]) -> FloatArray:
-    """(n, 3) float64: points on the edges of a box, mm."""
-    along = np.linspace(0, 1, _STEPS)
-    least, most = np.array(box_mm)
-    shares = [
-        np.insert(np.array(corner, dtype=np.float64), axis, share)
-        for axis in range(3)
-        for corner in product((0, 1), repeat=2)
-        for share in along
-    ]
-    return np.asarray(least + np.array(shares) * (most - least))
-
-
-def _about(seen: NDArray[np.bool_], extent: int) -> slice:
-    """From the first that is seen to the last, with room beside them, and not fewer than the noise needs."""
-    inside = np.flatnonzero(seen)
-    first, last = int(inside[0]) - _BESIDE_PX, int(inside[-1]) + 1 + _BESIDE_PX
-    more = max(_LEAST_PX - (last - first), 0)
-    first = max(min(first - more // 2, extent - _LEAST_PX), 0)
-    return slice(first, min(max(last + more - more // 2, first + _LEAST_PX), extent))
-
-
-def _stretch(region: Region, device: Pinhole, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(n,) float64 each: the nearest and the furthest depth of each ray in the region, mm; the nearest is not the
-    smaller one where the ray does not meet it. directions : (n, 3) float64, as `rays` gives them.
-    """
-    near, far = region.depth_mm or (0.0, np.inf)
-    nearest, furthest = np.full(len(directions), max(near, 0.0)), np.full(len(directions), far)
-    if region.box_mm is not None:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ends = (np.array(region.box_mm)[:, np.newaxis] - device.centre_mm) / directions
-        # Where a ray runs along a side and lies on it, 0/0 says nothing of it.
-        nearest = np.fmax(nearest, np.fmin(*ends).max(axis=1))
-        furthest = np.fmin(furthest, np.fmax(*ends).min(axis=1))
-    return nearest, furthest
 
 
 def _light(
