@@ -12,9 +12,9 @@ from starlette.responses import StreamingResponse
 
 from slrig.api.events import Held
 from slrig.api.problems import problems
-from slrig.api.schemas import filled
+from slrig.api.schemas import ReconstructionRequest, ScanRequest, filled, scan_plan
 from slrig.api.service import Serving
-from slrig.bundle import Strict
+from slrig.bundle import PresetName, RegionTable, Strict
 from slrig.errors import SlrigError
 from slrig.live.room import LiveOptions, LiveStatus, Viewer
 from slrig.live.stream import message
@@ -29,12 +29,14 @@ router = APIRouter(prefix="/live", tags=["rig"])
 
 _STREAM: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "Messages, each a head of eight bytes (two little-endian uint32: lengths of a JSON text and of "
-        "the bytes after it), the text, the bytes. `kind` is `geometry` first (deflated float32 (height, width, 2), "
-        "x/z and y/z of each pixel), then `depth` (deflated planes of one byte a pixel: low and high bytes of the "
-        "differences along each row of q, modulo 65536; a code of σ; `state`; grey), `wait` when none comes, and `end` "
-        "with its `reason`. Depth along the camera's axis: near_mm + (q − 1) unit_mm, none where q is 0; σ: 0.0001 mm "
-        "· 1.05^(code − 1), none where it is 0; state: 0 measured, 1 moved, 2 saturated, 3 dark, 4 unclear, 5 unseen.",
+        "description": "Messages, each a head of eight bytes (two little-endian uint32: lengths of a JSON text and "
+        "of the bytes after it), the text, the bytes. `kind` is `geometry` first (deflated float32 (height, "
+        "width, 2), x/z and y/z of each pixel; `part_px`, left, top, right and bottom of what is decoded of the "
+        "camera's image), then `depth` (deflated planes of one byte a pixel: low and high bytes of the "
+        "differences along each row of q, modulo 65536; a code of σ; `state`; grey), `wait` when none comes, and "
+        "`end` with its `reason`. Depth along the camera's axis: near_mm + (q − 1) unit_mm, none where q is 0; σ: "
+        "0.0001 mm · 1.05^(code − 1), none where it is 0; state: 0 measured, 1 moved, 2 saturated, 3 dark, 4 "
+        "unclear, 5 unseen, 6 outside the region.",
         "content": {_TYPE: {"schema": {"type": "string", "format": "binary"}}},
     }
 }
@@ -45,9 +47,19 @@ class LiveRequest(Strict):
 
     camera: str | None = Field(default=None, max_length=64, description="default: the first of the rig")
     step: int | None = Field(
-        default=None, ge=1, le=16, description="pixels from one decoded point to the next. Default: all, up to 1.5 Mpx"
+        default=None,
+        ge=1,
+        le=16,
+        description="at least, pixels from one decoded point to the next. Default: 1, up to 1.5 Mpx. Decoded is "
+        "what viewers watch",
     )
     exposure_s: float | None = Field(default=None, gt=0, le=LONGEST_S, description="default: the rig file's")
+    preset: PresetName | None = Field(default=None, description="whose region counts, as for a scan by it")
+    region: RegionTable | None = Field(
+        default=None,
+        description="what of the scene is decoded, as in a scan's `reconstruction`; default: the preset's or the rig "
+        "file's, {} for everything. Pixels outside of it have no depth",
+    )
 
 
 class LiveBody(BaseModel):
@@ -69,14 +81,17 @@ def look_at_live(service: Serving) -> LiveBody:
     return _body(service.manager.live.status())
 
 
-@router.post("", status_code=201, responses=problems(409, 502, 503))
+@router.post("", status_code=201, responses=problems(404, 409, 502, 503))
 def start_live(service: Serving, request: Annotated[LiveRequest, Body(default_factory=LiveRequest)]) -> LiveBody:
     """Begin live depth: the rig repeats a short sequence while it is idle. Unwatched for 10 s, it ends."""
     camera = request.camera
     if camera is None:
         facts = service.manager.rig.facts
         camera = next(iter(facts.cameras), "") if facts is not None else ""
-    return _body(service.manager.go_live(LiveOptions(camera, request.step, request.exposure_s)))
+    preset = None if request.preset is None else service.presets.get(request.preset)
+    scan = ScanRequest(preset=request.preset, reconstruction=ReconstructionRequest(region=request.region))
+    region = scan_plan(scan, service.scan_defaults, preset).reconstruction.region
+    return _body(service.manager.go_live(LiveOptions(camera, request.step, request.exposure_s, region)))
 
 
 @router.delete("", status_code=204)

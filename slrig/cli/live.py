@@ -27,6 +27,10 @@ def live(
     camera: Annotated[str | None, typer.Option(help="Camera of the rig. Default: the first.")] = None,
     step: Annotated[int | None, typer.Option(min=1, max=64, help="Pixels from point to point. Default: 3.")] = None,
     exposure_s: Annotated[float | None, typer.Option(help="Exposure, seconds. Default: the rig file's.")] = None,
+    region: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="TOML file of what is shown, as a scan's. Default: the rig's."),
+    ] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="Stop after so long. Default: at Ctrl-C.")] = None,
     record: Annotated[Path | None, typer.Option(metavar="FILE", help="New file for the depth images.")] = None,
     export: Annotated[
@@ -38,6 +42,7 @@ def live(
     The projector repeats a short sequence, and each new frame gives a new depth image. Prints what it says of the aim;
     the page shows it as pictures. A scan goes first, and live depth goes on after it.
     """
+    from slrig.bundle import read_region
     from slrig.client import read_recording
 
     if record is not None and (recording is not None or export is not None):
@@ -50,7 +55,8 @@ def live(
         _show(read_recording(recording), export, None)
         return
     with service.client() as client:
-        client.live.start(camera, exposure_s=exposure_s)
+        limits = None if region is None else read_region(region).model_dump(mode="json", exclude_unset=True)
+        client.live.start(camera, exposure_s=exposure_s, region=limits)
         try:
             if record is not None:
                 count = client.live.record(record, step=step, seconds=10.0 if seconds is None else seconds)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,9 +27,9 @@ _LEAST_SIGMA_MM, _SIGMA_RATIO = 1e-4, 1.05
 class LiveFrame:
     """One depth image. depth_mm, sigma_mm : (h, w) float32, along the camera's axis, NaN where none is known. state :
     (h, w) uint8: 0 measured, 1 moved (its frames do not show one surface, and the depth may be off by `moved_mm` of
-    `facts`), 2 saturated, 3 dark, 4 unclear, 5 unseen by camera or projector. grey : (h, w) uint8. directions : (h, w,
-    2) float32, x/z and y/z of each ray in the camera. facts : number, time_s, window_s, age_s (from the arrival of the
-    newest frame to the image), shares by state, distance_mm, tilt_deg and more.
+    `facts`), 2 saturated, 3 dark, 4 unclear, 5 unseen by camera or projector, 6 outside the region. grey : (h, w)
+    uint8. directions : (h, w, 2) float32, x/z and y/z of each ray in the camera. facts : number, time_s, window_s,
+    age_s (from the arrival of the newest frame to the image), shares by state, distance_mm, tilt_deg and more.
     """
 
     depth_mm: NDArray[np.float32]
@@ -51,9 +51,20 @@ class LiveFrame:
 class Live(Resource):
     """Live depth of a service: the rig repeats a short sequence while it is idle."""
 
-    def start(self, camera: str | None = None, *, step: int | None = None, exposure_s: float | None = None) -> Json:
-        """Begin. step : pixels from one decoded point to the next. Raises ServiceError: there is one already."""
-        options = given(camera=camera, step=step, exposure_s=exposure_s)
+    def start(
+        self,
+        camera: str | None = None,
+        *,
+        step: int | None = None,
+        exposure_s: float | None = None,
+        preset: str | None = None,
+        region: Mapping[str, Any] | None = None,
+    ) -> Json:
+        """Begin. step : at least, pixels from one decoded point to the next. region : what of the scene is decoded, as
+        {"depth_mm": [400, 700]}; None for that of the preset or of the rig file. Raises ServiceError: there is one
+        already with other options.
+        """
+        options = given(camera=camera, step=step, exposure_s=exposure_s, preset=preset, region=region)
         return self._connection.json("POST", "/live", json=options)
 
     def status(self) -> Json:

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.live.plan import STEPS, LivePlan
-from slrig.model import Axis, Calibration, Gray, Pinhole, Pixels
-from slrig.reconstruction import pixel_rays, project
+from slrig.model import Axis, Calibration, Gray, Pinhole, Pixels, Region
+from slrig.reconstruction import ImagePart, part_of_region, project
 
 Float32 = NDArray[np.float32]
 
@@ -65,6 +65,7 @@ class PixelState(IntEnum):
     DARK = 3
     UNCLEAR = 4
     UNSEEN = 5
+    OUTSIDE = 6
 
 
 class RayTable(NamedTuple):
@@ -84,12 +85,19 @@ class RayTable(NamedTuple):
     directions: Float32
     depth_mm: float
 
+    def every(self, step: int) -> RayTable:
+        """The table of every `step`-th of its pixels along rows and columns."""
+        maps: dict[str, Any] = {
+            name: np.ascontiguousarray(each[::step, ::step])
+            for name, each in self._asdict().items()
+            if isinstance(each, np.ndarray)
+        }
+        return self._replace(**maps)
 
-def ray_table(camera: Pinhole, projector: Pinhole, axis: Axis, step: int) -> RayTable:
-    """Compute the table of every `step`-th pixel along rows and columns."""
-    rows, columns = camera.size.shape
-    v, u = np.mgrid[0:rows:step, 0:columns:step].astype(np.float64)
-    rays = pixel_rays(camera, np.column_stack([u.ravel(), v.ravel()]))
+
+def ray_table(camera: Pinhole, projector: Pinhole, axis: Axis, part: ImagePart) -> RayTable:
+    """Compute the table of all pixels of a part of the camera's image."""
+    rays, shape = part.rays(camera), part.asked.shape
     along = 0 if axis is Axis.COLUMN else 1
     depth_mm = _meeting_distance_mm(camera, projector)
     # Of a projector without distortion, u (q₂ + t₂ w) = f (q₀ + t₀ w) + s … with w = 1/z: three depths of each ray
@@ -121,8 +129,8 @@ def ray_table(camera: Pinhole, projector: Pinhole, axis: Axis, step: int) -> Ray
             off.append((exact - position) / np.prod([position - node for node in nodes], axis=0))
         cubic = np.nan_to_num(np.mean(off, axis=0))
     in_camera = rays @ camera.rotation.T
-    maps = np.array([middle, inverses[1], rise, bend, cubic], np.float32).reshape(5, *u.shape)
-    directions = (in_camera[:, :2] / in_camera[:, 2:]).reshape(*u.shape, 2).astype(np.float32)
+    maps = np.array([middle, inverses[1], rise, bend, cubic], np.float32).reshape(5, *shape)
+    directions = (in_camera[:, :2] / in_camera[:, 2:]).reshape(*shape, 2).astype(np.float32)
     return RayTable(
         maps[0], maps[1], maps[2], maps[3], maps[4], (nodes[0], nodes[1], nodes[2]), directions, depth_mm
     )  # fmt: skip
@@ -161,25 +169,53 @@ class DepthImage:
     blur_px: float | None
 
 
+class LiveView:
+    """What of a camera's images is decoded, and where its rays meet the light.
+
+    Raises ConfigError: nothing of the region is in the camera's image, or it names another extent.
+    """
+
+    def __init__(self, calibration: Calibration, camera: str, axis: Axis, region: Region | None = None) -> None:
+        if calibration.projector is None:
+            message = "live depth needs a calibrated projector"
+            raise ValueError(message)
+        self.camera, self.projector = calibration.cameras[camera], calibration.projector
+        self.solved, self.region = calibration.solved, region or Region()
+        self.part = part_of_region(self.region, camera, self.camera.size, self.camera)
+        self.table = ray_table(self.camera, self.projector, axis, self.part)
+        self.extent_px = float(self.projector.size.along(axis))
+
+    def limits_mm(self, step: int) -> tuple[Float32, Float32] | None:
+        """(h, w) float32 each: nearest and furthest depth of each ray within the region, the nearest not the smaller
+        one where it is outside of it; None where nothing is limited.
+        """
+        part, region = self.part, self.region
+        if part.depths_mm is None and region.max_sigma_mm is None and part.asked.all():
+            return None
+        near, far = part.depths_mm or (np.zeros(part.asked.shape), np.full(part.asked.shape, np.inf))
+        few = np.s_[::step, ::step]
+        asked = part.asked[few]
+        return tuple(  # type: ignore[return-value] # two of them
+            np.where(asked, each[few], beyond).astype(np.float32) for each, beyond in ((near, np.inf), (far, -np.inf))
+        )
+
+
 class LiveDecoder:
     """Takes frames of a live sequence, and makes depth images of the newest ones. For one thread.
 
-    clipped_at : value from which a sample is saturated.
+    seen : what of the camera's images is decoded. step : pixels from ray to ray along rows and columns. clipped_at :
+    value from which a sample is saturated.
     """
 
-    def __init__(
-        self, plan: LivePlan, calibration: Calibration, camera: str, *, step: int, clipped_at: float, full_scale: float
-    ) -> None:
-        device, projector = calibration.cameras[camera], calibration.projector
-        if projector is None:
-            message = "live depth needs a calibrated projector"
-            raise ValueError(message)
-        self.plan = plan
-        self._calibration, self._camera = calibration, camera
-        self.table = ray_table(device, projector, plan.axis, step)
-        self._extent_px = float(projector.size.along(plan.axis))
+    def __init__(self, plan: LivePlan, seen: LiveView, *, step: int, clipped_at: float, full_scale: float) -> None:
+        self.plan, self.seen = plan, seen
+        self.table = seen.table.every(step)
+        self._limits, self._most_sigma_mm = seen.limits_mm(step), np.float32(seen.region.max_sigma_mm or np.inf)
+        # A sinusoid that is in focus has half of what white has above black.
+        self._least = np.float32(max(_LEAST_MODULATION, (seen.region.min_contrast or 0.0) / 2) * full_scale)
+        self._extent_px = seen.extent_px
         self.contradiction: str | None = None
-        self._step = step
+        self.step = step
         self._clipped_at, self._full_scale = clipped_at, full_scale
         count, shape = len(plan.patterns), self.table.middle.shape
         self._frames: NDArray[Any] | None = None
@@ -201,8 +237,10 @@ class LiveDecoder:
         self._earlier: deque[Float32] = deque(maxlen=count)
 
     def add(self, pattern: int, image: Pixels, begin_s: float, end_s: float) -> str | None:
-        """Take the newest frame of a pattern, copied; return why it is left out, None if it counts."""
-        lattice = image[:: self._step, :: self._step]
+        """Take the newest frame of a pattern, or that part of it which is `seen`, copied; return why it is left out,
+        None if it counts.
+        """
+        lattice = image[:: self.step, :: self.step]
         if self._frames is None:
             self._frames = np.zeros((len(self.plan.patterns), *lattice.shape), image.dtype)
             self._few = np.ascontiguousarray(self._frames[:, ::_SAMPLED, ::_SAMPLED])
@@ -265,7 +303,7 @@ class LiveDecoder:
             _depth_kernel, shape[0], self._real, self._imaginary, self._total, self._changed, self._clipped, rough,
             uncertain, np.float32(len(plan.fine)), np.float32(plan.fine_px), np.float32(self._extent_px),
             np.float32(_CELLS_APART if plan.bits else _WRONG_PERIOD), harmonic, read, slope,
-            np.float32(_LEAST_MODULATION * self._full_scale), np.float32(255 / self._full_scale), table.middle,
+            self._least, np.float32(255 / self._full_scale), table.middle,
             table.inverse, table.rise, table.bend, table.cubic, *(np.float32(each) for each in table.nodes),
             np.float32(table.depth_mm), raw, sigma, grey, state, reach, depth,
         )  # fmt: skip
@@ -276,6 +314,8 @@ class LiveDecoder:
             self.contradiction = "fine and coarse patterns contradict one another: frames may be one pattern late"
             return None
         in_bands(_alone_kernel, shape[0], raw, reach, state, depth, sigma)
+        if self._limits is not None:
+            in_bands(_limit_kernel, shape[0], *self._limits, self._most_sigma_mm, depth, sigma, state, grey)
         moved_mm = None
         if self._earlier:
             change = np.abs(depth[few] - self._earlier[0])[state[few] == PixelState.MOVED]
@@ -290,7 +330,7 @@ class LiveDecoder:
         """Return the share of points (n, 3), mm in the camera's frame, within the volume that was calibrated; None if
         that is unknown.
         """
-        solved, camera = self._calibration.solved, self._calibration.cameras[self._camera]
+        solved, camera = self.seen.solved, self.seen.camera
         if solved is None:
             return None
         world = (points - camera.translation_mm) @ camera.rotation
@@ -624,3 +664,19 @@ def _alone_kernel(first: int, last: int, raw: Any, reach: Any, state: Any, depth
             depth[y, x] = raw[y, x] if state[y, x] == 0 else depth[y, x]
         for x in range(columns):
             sigma[y, x] = np.float32(np.nan) if np.isnan(depth[y, x]) else sigma[y, x]
+
+
+@kernel(in_every_scan=False)
+def _limit_kernel(
+    first: int, last: int, near: Any, far: Any, most_sigma: Any, depth: Any, sigma: Any, state: Any, grey: Any
+) -> None:
+    """Take away what is outside of the region: depths beyond its limits, and everything where it is not seen."""
+    for y in range(first, last):
+        for x in range(depth.shape[1]):
+            if near[y, x] >= far[y, x]:
+                grey[y, x] = 0
+            elif not (depth[y, x] < near[y, x] or depth[y, x] > far[y, x] or sigma[y, x] > most_sigma):
+                continue
+            state[y, x] = 6
+            depth[y, x] = np.float32(np.nan)
+            sigma[y, x] = np.float32(np.nan)

@@ -23,8 +23,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slrig.failure import JobFailure, job_failure
 from slrig.live.plan import LivePlan
-from slrig.model import Calibration, CameraFormat, Pixels
+from slrig.model import Calibration, CameraFormat, Pixels, Region
 
 _SERVER = "slrig.live.server"
 
@@ -32,16 +33,22 @@ PLACES = 8
 """Frames that shared memory holds: those of the last tenths of a second. Later ones replace the earliest. After the
 number of the frame in each place comes that of the last frame that was taken."""
 
+_MOST_BEHIND = 8 * PLACES
+"""Messages that wait in the pipe: a process that is stopped, or still compiles, must not fill it."""
+
 
 @dataclass(frozen=True, slots=True)
 class LiveTask:
-    """What to decode. camera : its name in the calibration. step : pixels from ray to ray along rows and columns."""
+    """What to decode. camera : its name in the calibration. step : at least, pixels from ray to ray along rows and
+    columns. region : what of the scene; None for all.
+    """
 
     plan: LivePlan
     calibration: Calibration
     camera: str
     format: CameraFormat
     step: int = 1
+    region: Region | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +66,7 @@ class FrameCame:
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """Parent to child: which steps, in pixels of the decoded image, viewers watch."""
+    """Parent to child: which steps, in pixels of the camera, viewers watch."""
 
     steps: tuple[int, ...]
 
@@ -82,9 +89,10 @@ class GeometryCame:
 
 @dataclass(frozen=True, slots=True)
 class LiveFailed:
-    """Child to parent: it cannot go on."""
+    """Child to parent: it cannot go on. trace : for the log."""
 
-    cause: str
+    fault: JobFailure
+    trace: str
 
 
 class LiveProcess:
@@ -112,7 +120,9 @@ class LiveProcess:
         return self._number - int(self._numbers[PLACES])
 
     def put(self, pattern: int, image: Pixels, begin_s: float, end_s: float) -> None:
-        """Hand over a frame. Returns at once."""
+        """Hand over a frame. Returns at once. Where many wait, because the process stands still, it is dropped."""
+        if self.behind >= _MOST_BEHIND:
+            return
         self._number += 1
         place = self._number % PLACES
         self._numbers[place] = -1
@@ -149,9 +159,9 @@ def serve_live(pipe: Connection, task: LiveTask, memory: Any, numbers: Any, samp
         importlib.import_module(_SERVER).LiveServer(pipe, task, frames, numbers).run()
     except (EOFError, ConnectionError):
         return
-    except Exception:  # noqa: BLE001 - the parent is told, and ends the live depth by it
+    except Exception as error:  # noqa: BLE001 - the parent is told, and ends the live depth by it
         with contextlib.suppress(OSError):
-            pipe.send(LiveFailed(traceback.format_exc()))
+            pipe.send(LiveFailed(job_failure(error), traceback.format_exc()))
     finally:
         # No thread of a kernel holds the process up.
         os._exit(0)

@@ -14,10 +14,11 @@ import structlog
 
 from slrig.devices import CameraInfo, ProjectorInfo, Rig
 from slrig.errors import CalibrationError, LiveStateError, SlrigError, WorkerLostError
+from slrig.failure import UNEXPECTED, error_of
 from slrig.live.plan import live_plan
 from slrig.live.player import play
 from slrig.live.process import DepthCame, GeometryCame, LiveFailed, LiveProcess, LiveTask
-from slrig.model import Calibration, Shot, triangulated_axis
+from slrig.model import Calibration, Region, Shot, triangulated_axis
 
 UNWATCHED_S = 10.0
 """Live depth without a viewer ends after this time."""
@@ -25,19 +26,21 @@ UNWATCHED_S = 10.0
 _MOST_POINTS = 1_500_000  # decoded by default
 _RATE_OF = 20  # depth images
 _COMPUTED_PER_S, _GLANCE_S = 21.0, 0.004
+_LOST = "The live depth ended, because its process did. Start it again (POST /live); the service's log says more."
 
 _log = structlog.get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class LiveOptions:
-    """What somebody asks for. step : pixels from one decoded ray to the next; None for all, of large cameras fewer.
-    exposure_s : None for that of the rig file.
+    """What somebody asks for. step : at least, pixels from one decoded ray to the next; None for all, of large cameras
+    fewer. exposure_s : None for that of the rig file. region : what of the scene; None for all.
     """
 
     camera: str
     step: int | None = None
     exposure_s: float | None = None
+    region: Region | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +96,7 @@ class _Session:
 
     @property
     def steps(self) -> tuple[int, ...]:
-        return tuple(sorted({viewer.step // self.task.step for viewer in self.viewers}))
+        return tuple(sorted({viewer.step for viewer in self.viewers}))
 
 
 class LiveRoom:
@@ -119,7 +122,8 @@ class LiveRoom:
     ) -> LiveStatus:
         """Begin, or go on with one by the same options; another one without viewers is replaced.
 
-        Raises LiveStateError: another one has viewers. CalibrationError, PatternError: there can be none.
+        Raises LiveStateError: another one has viewers. CalibrationError, PatternError: there can be none. ConfigError:
+        the region names another camera, or a mask of another extent.
         """
         if calibration is None or calibration.projector is None or options.camera not in calibration.cameras:
             message = (
@@ -127,9 +131,11 @@ class LiveRoom:
                 "Calibrate it (POST /calibration), or look through the camera meanwhile (GET /preview/CAMERA)."
             )
             raise CalibrationError(message)
+        if options.region is not None:
+            options.region.require_fits({name: each.size for name, each in calibration.cameras.items()})
         plan = live_plan(projector, triangulated_axis([calibration.cameras[options.camera]], calibration.projector))
         step = options.step or _default_step(camera)
-        task = LiveTask(plan, calibration, options.camera, camera.format, step)
+        task = LiveTask(plan, calibration, options.camera, camera.format, step, options.region)
         with self._changed:
             other = self._session
             if other is not None and other.options == options and other.task.calibration.digest == calibration.digest:
@@ -181,8 +187,8 @@ class LiveRoom:
             own = session.task.step
             viewer = Viewer(self, session, own * max(1, -(-step // own)))
             session.viewers = [*session.viewers, viewer]
-            steps = session.steps
-        session.process.want(steps)
+            # Not later, when another one's may have come first.
+            session.process.want(session.steps)
         self._woken()
         return viewer
 
@@ -191,14 +197,14 @@ class LiveRoom:
         session = viewer.session
         with self._changed:
             session.viewers = [each for each in session.viewers if each is not viewer]
-            steps = session.steps
-        session.process.want(steps)
-        if not steps:
+            session.process.want(session.steps)
+            unwatched = not session.viewers
+        if unwatched:
             self._end_unless_watched(session)
 
     def message(self, viewer: Viewer, after: int, timeout_s: float) -> tuple[int, bytes] | None:
         """See `Viewer.message`."""
-        session, step = viewer.session, viewer.step // viewer.session.task.step
+        session, step = viewer.session, viewer.step
 
         def found() -> tuple[int, bytes] | None:
             newest = session.newest
@@ -267,7 +273,7 @@ class LiveRoom:
 
     def _listen(self, session: _Session) -> None:
         """Take what the process says, on a thread of its own, so that it never waits."""
-        cause = "its process ended"
+        error: SlrigError = WorkerLostError(_LOST)
         while True:
             try:
                 came = session.process.messages.recv()
@@ -280,10 +286,12 @@ class LiveRoom:
                     session.newest = came
                     session.came_s.append(time.monotonic())
                 elif isinstance(came, LiveFailed):
-                    cause = came.cause.strip().splitlines()[-1]
-                    _log.error("live depth failed", trace=came.cause)
+                    if came.fault.code == UNEXPECTED:
+                        _log.error("live depth failed", trace=came.trace)
+                    else:
+                        error = error_of(came.fault)
                 self._changed.notify_all()
-        self._finish(session, WorkerLostError(f"The live depth ended: {cause}. Start it again (POST /live)."))
+        self._finish(session, error)
 
     def _finish(self, session: _Session, error: SlrigError) -> None:
         with self._changed:

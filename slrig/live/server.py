@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
+from collections.abc import Iterable
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -11,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.capture import NEAR_SATURATION
-from slrig.live.depth import FARTHEST, NEAREST, DepthImage, LiveDecoder, PixelState
+from slrig.live.depth import FARTHEST, NEAREST, DepthImage, LiveDecoder, LiveView, PixelState
 from slrig.live.process import PLACES, DepthCame, FrameCame, GeometryCame, LiveTask, Wanted
 from slrig.live.stream import depth_message, geometry_message
 
-_FACTS_STEP = 12  # of rows and columns, by which what an image says is computed
+_FACTS_POINTS = 9_000  # by which what an image says is computed
+_FEWEST_POINTS = 60_000  # that are decoded: the noise is told by them
 _LEAST_POINTS = 100
 _PLANE_TURNS = 3
 
@@ -25,53 +28,55 @@ class LiveServer:
 
     def __init__(self, pipe: Connection, task: LiveTask, frames: NDArray[Any], numbers: Any) -> None:
         self._pipe, self._task, self._frames, self._numbers = pipe, task, frames, numbers
-        full = float(task.format.full_scale)
-        self._decoder = LiveDecoder(
-            task.plan, task.calibration, task.camera, step=task.step, clipped_at=NEAR_SATURATION * full, full_scale=full
-        )
-        depth_mm = self._decoder.table.depth_mm
+        self._view = LiveView(task.calibration, task.camera, task.plan.axis, task.region)
+        self._decoder = self._decoding(task.step)
+        # Another step is decoded beside the one before until it has an image, so that nobody's picture stands still.
+        self._next: LiveDecoder | None = None
+        depth_mm = self._view.table.depth_mm
         # Ends of the quantised depths: as far as `LiveDecoder` looks.
         self._near_mm, self._unit_mm = NEAREST * depth_mm, (FARTHEST - NEAREST) * depth_mm / 65534
         self._steps: tuple[int, ...] = ()
         self._left_out: Counter[str] = Counter()
-        self._lost = 0
+        self._lost, self._made = 0, 0
         self._came_s = 0.0
 
     def run(self) -> None:
         """Serve until the parent's end of the pipe is gone. Raises EOFError or ConnectionError then."""
-        number = 0
         while True:
-            came = self._receive(self._pipe.recv())
-            # Newest frame wins: all that have come are taken, and one depth image is made of them.
-            while self._pipe.poll():
-                came = self._receive(self._pipe.recv()) or came
-            if not came or not self._steps:
-                continue
+            self.turn()
+
+    def turn(self) -> None:
+        """Wait for messages, and send the depth image of the frames that have come. Raises as `run` does."""
+        came = self._receive(self._pipe.recv())
+        # Newest frame wins: all that have come are taken, and one depth image is made of them.
+        while self._pipe.poll():
+            came = self._receive(self._pipe.recv()) or came
+        if not came or not self._steps:
+            return
+        image = None if self._next is None else self._next.depth()
+        if self._next is not None and image is not None:
+            self._decoder, self._next = self._next, None
+        else:
             image = self._decoder.depth()
-            if image is None:
-                if self._decoder.contradiction is not None:
-                    self._left_out[self._decoder.contradiction] += 1
-                continue
-            number += 1
-            facts = {**depth_facts(image, self._decoder), "number": number, "left_out": sum(self._left_out.values()),
-                     "lost": self._lost, "causes": dict(self._left_out.most_common(3))}  # fmt: skip
-            facts["age_s"] = round(time.monotonic() - self._came_s, 4)
-            made = {each: depth_message(image, each, self._near_mm, self._unit_mm, facts) for each in self._steps}
-            self._pipe.send(DepthCame(number, made, facts))
+        if image is None:
+            if self._decoder.contradiction is not None:
+                self._left_out[self._decoder.contradiction] += 1
+            return
+        self._made += 1
+        facts = {**depth_facts(image, self._decoder), "number": self._made, "left_out": sum(self._left_out.values()),
+                 "lost": self._lost, "causes": dict(self._left_out.most_common(3))}  # fmt: skip
+        facts["age_s"] = round(time.monotonic() - self._came_s, 4)
+        made = {
+            each: depth_message(image, each // self._decoder.step, self._near_mm, self._unit_mm, facts)
+            for each in self._steps
+            if each % self._decoder.step == 0
+        }
+        self._pipe.send(DepthCame(self._made, made, facts))
 
     def _receive(self, message: object) -> bool:
         """Take a message; return whether it brought a frame that counts."""
         if isinstance(message, Wanted):
-            facts = {"camera": self._task.camera, "axis": str(self._task.plan.axis)}
-            steps = message.steps
-            new = {
-                each: geometry_message(self._decoder.table.directions, each, {**facts, "step": each * self._task.step})
-                for each in steps
-                if each not in self._steps
-            }
-            self._steps = steps
-            if new:
-                self._pipe.send(GeometryCame(new))
+            self._want(message.steps)
             return False
         if not isinstance(message, FrameCame):
             return False
@@ -79,25 +84,69 @@ class LiveServer:
         if self._numbers[place] != message.number:
             self._lost += 1
             return False
-        image = self._frames[place].copy()
+        part = self._view.part
+        image = self._frames[place][part.rows, part.columns].copy()
         if self._numbers[place] != message.number:
             self._lost += 1
             return False
         self._came_s = message.came_s
         cause = self._decoder.add(message.pattern, image, message.begin_s, message.end_s)
+        if self._next is not None:
+            self._next.add(message.pattern, image, message.begin_s, message.end_s)
         if cause is not None:
             self._left_out[cause] += 1
         return cause is None
+
+    def _want(self, steps: tuple[int, ...]) -> None:
+        """Make depth images for these steps from now on, and decode no more than they show."""
+        part = self._view.part
+        facts = {
+            "camera": self._task.camera, "axis": str(self._task.plan.axis),
+            "part_px": [part.columns.start, part.rows.start, part.columns.stop, part.rows.stop],
+        }  # fmt: skip
+        directions = self._view.table.directions
+        new = {
+            each: geometry_message(directions, each, {**facts, "step": each})
+            for each in steps
+            if each not in self._steps
+        }
+        self._steps = steps
+        if new:
+            self._pipe.send(GeometryCame(new))
+        step = decoded_step(steps, self._task.step, part.asked.size)
+        if not steps or step == self._decoder.step:
+            self._next = None
+        elif self._next is None or self._next.step != step:
+            self._next = self._decoding(step)
+
+    def _decoding(self, step: int) -> LiveDecoder:
+        task, full = self._task, float(self._task.format.full_scale)
+        return LiveDecoder(task.plan, self._view, step=step, clipped_at=NEAR_SATURATION * full, full_scale=full)
+
+
+def decoded_step(watched: Iterable[int], least: int, pixels: int) -> int:
+    """The coarsest step that has every pixel of those that are watched, and enough of all to tell their noise. least :
+    divides what is watched.
+
+    >>> decoded_step([4, 6], 1, 1_310_720), decoded_step([16], 1, 1_310_720), decoded_step([4], 1, 80_000)
+    (2, 4, 1)
+    """
+    common = math.gcd(*watched)
+    steps = range(least, common + 1, least)
+    return max((each for each in steps if common % each == 0 and pixels / each**2 >= _FEWEST_POINTS), default=least)
 
 
 def depth_facts(image: DepthImage, decoder: LiveDecoder) -> dict[str, Any]:
     """What one depth image says of the aim: shares of its pixels by state, distance and tilt of what it shows.
 
-    tilt_deg : angle between the camera's axis and the normal of the plane through most of the points; None without one.
+    shares : of the pixels within the region; "outside" is the share of all that are not. tilt_deg : angle between the
+    camera's axis and the normal of the plane through most of the points; None without one.
     """
-    few = np.s_[::_FACTS_STEP, ::_FACTS_STEP]
+    step = max(1, round(math.sqrt(image.state.size / _FACTS_POINTS)))
+    few = np.s_[::step, ::step]
     state = image.state[few]
-    shares = np.bincount(state.ravel(), minlength=len(PixelState)) / state.size
+    counts = np.bincount(state.ravel(), minlength=len(PixelState))
+    within = max(state.size - counts[PixelState.OUTSIDE], 1)
     measured = state == PixelState.MEASURED
     z = image.depth_mm[few][measured].astype(np.float64)
     facts: dict[str, Any] = {
@@ -105,7 +154,10 @@ def depth_facts(image: DepthImage, decoder: LiveDecoder) -> dict[str, Any]:
         "window_s": round(image.window_s, 6),
         "moved_mm": None if image.moved_mm is None else round(image.moved_mm, 3),
         "blur_px": None if image.blur_px is None else round(image.blur_px, 2),
-        "shares": {state.name.lower(): round(float(shares[state]), 5) for state in PixelState},
+        "shares": {
+            each.name.lower(): round(float(counts[each]) / (state.size if each is PixelState.OUTSIDE else within), 5)
+            for each in PixelState
+        },
         "meeting_mm": round(decoder.table.depth_mm, 1),
         "distance_mm": None,
         "sigma_mm": None,

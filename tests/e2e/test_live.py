@@ -16,6 +16,10 @@ from tests.e2e.conftest import KEY, serving, write_rig
 from tests.unit.command import done
 
 VIEWERS = 20
+LIMITED = """
+[scan.region.polygons_px]
+left = [[0, 0], [178, 0], [178, 192], [0, 192]]
+"""
 
 
 def _first(client: Client, count: int = 1) -> list[LiveFrame]:
@@ -26,13 +30,14 @@ def _first(client: Client, count: int = 1) -> list[LiveFrame]:
 def test_live_depth_is_seen_by_many_gives_way_to_a_scan_and_ends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with serving(write_rig(tmp_path / "rig"), tmp_path / "data") as service, service.client() as client:
+    rig = write_rig(tmp_path / "rig", faults=LIMITED)
+    with serving(rig, tmp_path / "data") as service, service.client() as client:
         with pytest.raises(ServiceError, match="There is no live depth"):
             client.live.status()
         while not client.get("/rig")["open"]:
             threading.Event().wait(0.1)
-        client.live.start()
-        assert client.live.start()["viewers"] == 0
+        client.live.start(region={})
+        assert client.live.start(region={})["viewers"] == 0
         watching = client.live.watch(step=2)
         next(watching)
         with pytest.raises(ServiceError, match="with other options"):
@@ -62,6 +67,9 @@ def test_live_depth_is_seen_by_many_gives_way_to_a_scan_and_ends(
         assert "depth images" in said
         recorded = list(read_recording(tmp_path / "aim.live"))
         assert recorded[0].depth_mm.shape == (48, 60)
+        # The rig file's region is the default.
+        assert (recorded[0].state[:, 45:] == 6).all()
+        assert (recorded[0].state[:, :44] != 6).all()
         done("live", tmp_path / "aim.live", "--export", tmp_path / "clouds")
         clouds = sorted((tmp_path / "clouds").iterdir())
         assert len(clouds) == len(recorded)
