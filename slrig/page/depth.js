@@ -6,9 +6,13 @@ import {duration, length, number, percent} from "./ui.js";
 import {OrbitControls} from "./vendor/OrbitControls.js";
 
 const HEAD_BYTES = 8;
-/** Points along the longer side of what is shown: more cost a browser's time, and no eye sees them. */
-const POINTS = 320;
+/** Pixels of the screen from point to point, and points along the longer side: more cost a browser's time, and no eye sees them. */
+const APART = 2;
+const [FEWEST, MOST] = [120, 480];
 const AGAIN_MS = 2000;
+const CHANGED_MS = 700;
+const STARTING = "Starting live depth …";
+const THEIRS = "Somebody else watches with other limits or another exposure: this is theirs.";
 const FACTS_MS = 300;
 const SHAPE_MS = 90;
 /** A step in depth from point to point, over the distance, that is no surface. */
@@ -16,48 +20,65 @@ const STEP = 0.012;
 const [MEASURED, MOVED, SATURATED, DARK, UNCLEAR] = [0, 1, 2, 3, 4];
 const COLOURS = {[MOVED]: [255, 154, 31], [SATURATED]: [224, 32, 32], [DARK]: [22, 28, 46], [UNCLEAR]: [90, 90, 90]};
 
-/** Live depth of a camera. `exposure_s`: null is the rig file's. */
-export function LiveDepth({camera, size_px, exposure_s}) {
+/** Live depth of a camera. `options`: what of the request is not as the rig has it. */
+export function LiveDepth({camera, size_px, options}) {
   const [facts, setFacts] = useState(null);
-  const [why, setWhy] = useState("Starting live depth …");
+  const [why, setWhy] = useState(STARTING);
+  const [theirs, setTheirs] = useState(false);
   const shape = useRef();
   const depth = useRef();
   const grey = useRef();
+  const view = useRef(null);
+  const begun = useRef(false);
+  // A canvas has one renderer for its life: a second one would find the context lost.
+  useEffect(() => {
+    view.current = shapeView(shape.current);
+    return () => view.current?.dispose();
+  }, []);
   useEffect(() => {
     const watching = new AbortController();
-    const view = shapeView(shape.current);
+    const {signal} = watching;
     let told = 0;
+    const shown = () => Math.max(...[shape, depth, grey].flatMap(({current: canvas}) => (canvas ? [canvas.clientWidth, canvas.clientHeight] : [0])));
     const show = (image) => {
+      if (signal.aborted) return;
       setWhy(null);
       paint(depth.current, image, depthColour(image));
       paint(grey.current, image, (at) => [image.grey[at], image.grey[at], image.grey[at]]);
-      view?.show(image);
+      view.current?.show(image);
       if (performance.now() - told > FACTS_MS) {
         told = performance.now();
         setFacts(image.facts);
       }
     };
-    const turn = async () => {
+    const turn = async (before) => {
+      let refused = null;
       try {
-        await ask("POST", "/live", {body: {camera, ...(exposure_s ? {exposure_s} : {})}});
-        await watch(Math.max(1, Math.ceil(Math.max(...size_px) / POINTS)), watching.signal, show, setWhy);
+        await ask("POST", "/live", {body: {camera, ...options}}).catch((problem) => {
+          refused = problem;
+        });
+        // Somebody else's is watched in its place, once this page's own of before is over.
+        if (refused && (refused.code !== "live-state" || before !== refused.code)) throw refused;
+        setTheirs(Boolean(refused));
+        await watch(size_px, shown, signal, show, setWhy);
       } catch (problem) {
-        if (watching.signal.aborted) return;
-        setWhy(problem.message);
+        if (!signal.aborted) setWhy(problem.message);
       }
-      if (!watching.signal.aborted) setTimeout(() => watching.signal.aborted || turn(), AGAIN_MS);
+      if (!signal.aborted) setTimeout(() => signal.aborted || turn(refused?.code), AGAIN_MS);
     };
-    turn();
+    // What is typed changes with every key, and one's own stream of before ends first.
+    const timer = setTimeout(turn, begun.current ? CHANGED_MS : 0);
+    begun.current = true;
     return () => {
+      clearTimeout(timer);
       watching.abort();
-      view?.dispose();
     };
-  }, [camera, exposure_s]);
+  }, [camera, JSON.stringify(options)]);
   return html`<div class="aimed depths">
     <figure><canvas ref=${shape} aria-label="Shape: drag turns it, the wheel zooms"></canvas><figcaption>Shape</figcaption></figure>
     <figure><canvas ref=${depth} role="img" aria-label="Depth in colours, near is yellow"></canvas><figcaption>Depth</figcaption></figure>
     <figure><canvas ref=${grey} role="img" aria-label=${`Light that camera ${camera} sees`}></canvas><figcaption>Camera ${camera}</figcaption></figure>
-    <p class="told" role="status">${why ?? (facts && aimWords(facts))}</p>
+    <p class="told" role="status">${why ?? (facts && [theirs && THEIRS, aimWords(facts)].filter(Boolean).join(" "))}</p>
   </div>`;
 }
 
@@ -65,6 +86,7 @@ export function LiveDepth({camera, size_px, exposure_s}) {
 export function aimWords(facts) {
   const {shares} = facts;
   const words = [`${percent(shares.measured)} measured`];
+  if (shares.outside > 0.002) words.push(`${percent(shares.outside)} outside the limits`);
   if (facts.distance_mm !== null) words.push(`${length(facts.distance_mm)} away, the axes meet at ${length(facts.meeting_mm)}`, `σ ${length(facts.sigma_mm)}`);
   if (facts.tilt_deg !== null) words.push(`tilted by ${number(facts.tilt_deg, {decimals: 1})}°`);
   if (facts.in_volume !== null) words.push(`${percent(facts.in_volume)} within the calibrated volume`);
@@ -74,36 +96,69 @@ export function aimWords(facts) {
   return `${words.join("; ")}.`;
 }
 
-/** Show depth images until the service ends the stream, or `signal` is aborted. Throws why it ended. */
-async function watch(step, signal, show, say) {
-  const response = await fetch(`/live/depth?step=${step}`, {signal});
-  if (!response.ok) throw new Error((await response.json().catch(() => ({}))).detail ?? "Live depth cannot be watched.");
-  const reader = response.body.getReader();
-  let waiting = new Uint8Array(0);
-  let rays = null;
-  let waits = 0;
-  let drawing = Promise.resolve();
-  let busy = false;
-  for (;;) {
-    const {done, value} = await reader.read();
-    if (done) return;
-    waiting = joined(waiting, value);
-    for (let message = taken(waiting); message; message = taken(waiting)) {
-      waiting = waiting.subarray(message.end);
-      const {head, body} = message;
+/** How many of the camera's pixels lie from point to point, where a part of so many pixels is shown on so many of the screen. */
+export function stepOf(size_px, shown) {
+  const points = Math.min(Math.max(shown / APART, FEWEST), MOST);
+  return Math.min(Math.max(Math.round(Math.max(...size_px) / points), 1), 64);
+}
+
+/**
+ * Show depth images until the service ends the stream, or `signal` is aborted. Throws why it ended. `size_px`: of the
+ * camera; `shown()`: pixels of the screen along the longer side, as the window is now.
+ */
+async function watch(size_px, shown, signal, show, say) {
+  let size = size_px;
+  for (let again = true; again;) {
+    const step = stepOf(size, shown());
+    let rays = null;
+    let waits = 0;
+    let busy = false;
+    let problem = null;
+    again = false;
+    for await (const {head, body} of messages(`/live/depth?step=${step}`, signal)) {
+      if (problem) throw problem;
       if (head.kind === "end") throw new Error(head.reason);
       waits = head.kind === "wait" ? waits + 1 : 0;
       if (waits > 3) say("The picture comes when the rig is free.");
-      if (head.kind === "geometry") rays = new Float32Array(await inflated(body));
+      if (head.kind === "geometry") {
+        const [left, top, right, bottom] = head.part_px;
+        size = [right - left, bottom - top];
+        rays = new Float32Array(await inflated(body));
+      }
+      // The limits leave a part of the picture, or the window has another size.
+      again = stepOf(size, shown()) !== step;
+      if (again) break;
       // The newest image counts: one that comes while another is drawn is passed over.
       if (head.kind === "depth" && rays && !busy) {
         busy = true;
-        drawing = inflated(body.slice()).then((bytes) => show(decoded(head, new Uint8Array(bytes), rays))).finally(() => {
+        inflated(body.slice()).then((bytes) => show(decoded(head, new Uint8Array(bytes), rays))).catch((found) => {
+          problem = found;
+        }).finally(() => {
           busy = false;
         });
-        drawing.catch(() => {});
       }
     }
+  }
+}
+
+/** The messages of a stream, until it ends. The connection is closed when the caller breaks off. */
+async function* messages(path, signal) {
+  const response = await fetch(path, {signal});
+  if (!response.ok) throw new Error((await response.json().catch(() => ({}))).detail ?? "Live depth cannot be watched.");
+  const reader = response.body.getReader();
+  try {
+    let waiting = new Uint8Array(0);
+    for (;;) {
+      const {done, value} = await reader.read();
+      if (done) return;
+      waiting = joined(waiting, value);
+      for (let message = taken(waiting); message; message = taken(waiting)) {
+        waiting = waiting.subarray(message.end);
+        yield message;
+      }
+    }
+  } finally {
+    reader.cancel().catch(() => {});
   }
 }
 

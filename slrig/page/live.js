@@ -34,9 +34,9 @@ function useLooking() {
 /**
  * What a camera sees while nobody scans. `aim`: where a board goes next, as a calibration says it. `plain`: nothing is
  * marked. `exposure_s`: of the picture; null is the rig file's. `told(figures)` is called each second with what the picture says, see `measured`, and
- * with null when it is over. `ghost`: by camera, a picture that lies over the live one, half-transparent.
+ * with null when it is over. `limits`: of live depth, as a request has them. `ghost`: by camera, a picture that lies over the live one, half-transparent.
  */
-export function Live({rig, may, aim, ghost, plain = false, exposure_s = null, told}) {
+export function Live({rig, may, aim, ghost, plain = false, exposure_s = null, limits = {}, told}) {
   const [chosen, setChosen] = useState(() => sessionStorage.getItem(KEPT));
   const [light, setLight] = useState("white");
   const [view, setView] = useState("picture");
@@ -66,7 +66,7 @@ export function Live({rig, may, aim, ghost, plain = false, exposure_s = null, to
     setFailed(false);
   };
   return html`
-    ${inDepth ? html`<${LiveDepth} key=${camera} camera=${camera} size_px=${size_px} exposure_s=${exposure_s} />`
+    ${inDepth ? html`<${LiveDepth} key=${camera} camera=${camera} size_px=${size_px} options=${{...limits, ...(exposure_s ? {exposure_s} : {})}} />`
       : absent ? html`<div class="live none" role=${failed ? "alert" : null}>${absent}</div>`
       : html`<div class="aimed"><${Picture} key=${stream} stream=${stream} camera=${camera} running=${running} told=${told} failed=${() => setFailed(true)} />
         ${ghost?.[camera] && html`<img class="ghost" src=${ghost[camera]} alt="The last view, half-transparent" />`}
@@ -75,7 +75,7 @@ export function Live({rig, may, aim, ghost, plain = false, exposure_s = null, to
       ${names.length > 0 && html`<${Choice} label="Camera" value=${camera ?? OFF} options=${[...names.map((name) => [name, name]), [OFF, "Off"]]} chosen=${choose} />`}
       ${offered && camera && html`<${Choice} label="View" value=${view} options=${[["picture", "Picture"], ["depth", "Depth"]]} chosen=${setView} />`}
       ${camera && !absent && !inDepth && html`<${Choice} label="Projector" value=${light} options=${[["white", "White light"], ["off", "Dark"]]} chosen=${setLight} />`}
-      ${inDepth && html`<span class="legend"><span><span class="swatch moved"></span> moved</span><span><span class="swatch saturated"></span> saturated</span><span>black: dark or unseen</span></span>`}
+      ${inDepth && html`<span class="legend"><span><span class="swatch moved"></span> moved</span><span><span class="swatch saturated"></span> saturated</span><span>black: no depth</span></span>`}
       ${!absent && !inDepth && html`<span class="legend">${aimed && html`<span><span class="swatch aim"></span> The board goes here, its upper left corner to the dot.</span>`}
         ${!plain && html`<span><span class="swatch saturated"></span> saturated</span>`}${!plain && light === "white" && html`<span><span class="swatch dark"></span> too dark</span>`}${rig.holder && html`<span>Waits while the rig is in use.</span>`}</span>`}
     </div>`;

@@ -38,7 +38,7 @@ export function ScanScreen({rig, may}) {
   const blocked = whyNot(rig, may);
   const open = may("scan") && rig?.open && rig.calibrated === false;
   const presets = known?.presets.filter(({fault}) => !fault) ?? [];
-  const stage = html`<${Live} rig=${rig} may=${may} exposure_s=${exposures_s?.[0]} told=${setFigures} />
+  const stage = html`<${Live} rig=${rig} may=${may} exposure_s=${exposures_s?.[0]} limits=${{...(preset ? {preset} : {}), ...(region ? {region} : {})}} told=${setFigures} />
     ${active && html`<div class="over middle"><${UnderWay} key=${active.id} scan=${active} changed=${again} may=${may} /></div>`}`;
   const last = scans.find((scan) => scan.triangles !== null);
   return html`<${Workspace} label="Live picture" stage=${stage} top=${html`

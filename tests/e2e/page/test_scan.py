@@ -47,6 +47,12 @@ def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit:
     data = "canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data"
     drawn = f"canvas => {data}.filter((each) => each > 180).length"
     assert page.get_by_role("img", name="Depth in colours").evaluate(drawn) > 10_000
+    # What the next scan is limited to limits it, too.
+    page.get_by_text("Limit the scan").click()
+    farthest = page.get_by_label("Farthest depth, mm")
+    farthest.fill("580")
+    page.get_by_text("outside the limits;").wait_for()
+    farthest.fill("")
     page.get_by_role("button", name="Picture", exact=True).click()
     page.get_by_role("button", name="As the rig is set").click()
     page.get_by_role("button", name="Off").click()
