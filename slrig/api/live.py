@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
+from contextlib import suppress
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Query, Response
@@ -21,7 +23,7 @@ from slrig.live.stream import message
 from slrig.rig.preview import LONGEST_S
 
 _LOOK_S = 0.5
-"""How long one look for a message holds a thread; then the client is asked whether it is still there."""
+"""So long without a message, and the client is asked whether it is still there."""
 _STEP = 3
 _TYPE = "application/octet-stream"
 
@@ -108,25 +110,37 @@ async def watch_live(
 ) -> Response:
     """Watch live depth. Who reads slowly misses images, and always gets the newest one."""
     held.enter_context(service.streams.take())
-    viewer = await run_in_threadpool(service.manager.live.watch, step)
-    return StreamingResponse(_messages(viewer), media_type=_TYPE, headers={"Cache-Control": "no-store"})
+    loop, news = asyncio.get_running_loop(), asyncio.Event()
+
+    def told() -> None:
+        # The loop of a service that ends may be gone before its viewers are.
+        with suppress(RuntimeError):
+            loop.call_soon_threadsafe(news.set)
+
+    viewer = await run_in_threadpool(service.manager.live.watch, step, told)
+    return StreamingResponse(_messages(viewer, news), media_type=_TYPE, headers={"Cache-Control": "no-store"})
 
 
-async def _messages(viewer: Viewer) -> AsyncIterator[bytes]:
+async def _messages(viewer: Viewer, news: asyncio.Event) -> AsyncIterator[bytes]:
     number = -1
     with viewer:
         while True:
+            news.clear()
             try:
-                came = await run_in_threadpool(viewer.message, number, _LOOK_S)
+                came = viewer.message(number)
             except SlrigError as error:
                 yield message({"kind": "end", "code": error.code, "reason": str(error)}, b"")
                 return
-            if came is None:
+            if came is not None:
+                number, made = came
+                yield made
+                continue
+            try:
+                async with asyncio.timeout(_LOOK_S):
+                    await news.wait()
+            except TimeoutError:
                 # Whoever has gone is noticed by it.
                 yield message({"kind": "wait"}, b"")
-                continue
-            number, made = came
-            yield made
 
 
 def _body(status: LiveStatus) -> LiveBody:

@@ -59,17 +59,27 @@ class LiveStatus:
 
 
 class Viewer:
-    """Somebody who watches. Leave the `with` block to stop. step : pixels of the camera from point to point."""
+    """Somebody who watches. Leave the `with` block to stop. step : pixels of the camera from point to point. told :
+    called, from any thread, when there may be a message.
+    """
 
-    def __init__(self, room: LiveRoom, session: _Session, step: int) -> None:
-        self.session, self.step = session, step
+    def __init__(self, room: LiveRoom, session: _Session, step: int, told: Callable[[], None]) -> None:
+        self.session, self.step, self.told = session, step, told
         self._room = room
 
-    def message(self, after: int, timeout_s: float) -> tuple[int, bytes] | None:
+    def message(self, after: int) -> tuple[int, bytes] | None:
         """Return the newest message with a number above `after`, geometry being number 0, and that number; None when
-        none came in time. `after` : −1 for the first. Raises SlrigError: live depth is over.
+        there is none. `after` : −1 for the first. Waits for nobody. Raises SlrigError: live depth is over.
         """
-        return self._room.message(self, after, timeout_s)
+        session = self.session
+        error, newest, geometry = session.error, session.newest, session.geometry.get(self.step)
+        if error is not None:
+            raise error
+        if after < 0:
+            return None if geometry is None else (0, geometry)
+        if newest is not None and newest.number > after and self.step in newest.messages:
+            return newest.number, newest.messages[self.step]
+        return None
 
     def __enter__(self) -> Self:
         return self
@@ -98,6 +108,11 @@ class _Session:
     def steps(self) -> tuple[int, ...]:
         return tuple(sorted({viewer.step for viewer in self.viewers}))
 
+    def tell(self) -> None:
+        """Tell all who watch that there may be a message."""
+        for viewer in self.viewers:
+            viewer.told()
+
 
 class LiveRoom:
     """The live depth of a rig, if there is one. All but `run` may be called from any thread.
@@ -108,7 +123,7 @@ class LiveRoom:
 
     def __init__(self, woken: Callable[[], None]) -> None:
         self._woken = woken
-        self._changed = threading.Condition(threading.RLock())
+        self._lock = threading.RLock()
         self._session: _Session | None = None
 
     @property
@@ -136,7 +151,7 @@ class LiveRoom:
         plan = live_plan(projector, triangulated_axis([calibration.cameras[options.camera]], calibration.projector))
         step = options.step or _default_step(camera)
         task = LiveTask(plan, calibration, options.camera, camera.format, step, options.region)
-        with self._changed:
+        with self._lock:
             other = self._session
             if other is not None and other.options == options and other.task.calibration.digest == calibration.digest:
                 return self.status()
@@ -155,21 +170,21 @@ class LiveRoom:
 
     def end(self) -> None:
         """End live depth. Returns at once; the projector is dark when the exposure under way is over. Idempotent."""
-        with self._changed:
+        with self._lock:
             session = self._session
         if session is not None:
             self._finish(session, LiveStateError("The live depth was ended."))
 
     def fail(self, error: SlrigError) -> None:
         """End live depth by a fault of the rig, or of the service."""
-        with self._changed:
+        with self._lock:
             session = self._session
         if session is not None:
             self._finish(session, error)
 
     def status(self) -> LiveStatus:
         """Return what there is. Raises LiveStateError: nothing."""
-        with self._changed:
+        with self._lock:
             session = self._require()
             times = session.came_s
             rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else None
@@ -180,12 +195,14 @@ class LiveRoom:
                 session.playing, rate, None if session.newest is None else session.newest.facts,
             )  # fmt: skip
 
-    def watch(self, step: int) -> Viewer:
-        """Begin to watch every `step`-th pixel, or the next multiple that is decoded. Raises LiveStateError."""
-        with self._changed:
+    def watch(self, step: int, told: Callable[[], None]) -> Viewer:
+        """Begin to watch every `step`-th pixel, or the next multiple that is decoded. told : as `Viewer` has it. Raises
+        LiveStateError.
+        """
+        with self._lock:
             session = self._require()
             own = session.task.step
-            viewer = Viewer(self, session, own * max(1, -(-step // own)))
+            viewer = Viewer(self, session, own * max(1, -(-step // own)), told)
             session.viewers = [*session.viewers, viewer]
             # Not later, when another one's may have come first.
             session.process.want(session.steps)
@@ -195,30 +212,12 @@ class LiveRoom:
     def leave(self, viewer: Viewer) -> None:
         """Stop watching. Idempotent."""
         session = viewer.session
-        with self._changed:
+        with self._lock:
             session.viewers = [each for each in session.viewers if each is not viewer]
             session.process.want(session.steps)
             unwatched = not session.viewers
         if unwatched:
             self._end_unless_watched(session)
-
-    def message(self, viewer: Viewer, after: int, timeout_s: float) -> tuple[int, bytes] | None:
-        """See `Viewer.message`."""
-        session, step = viewer.session, viewer.step
-
-        def found() -> tuple[int, bytes] | None:
-            newest = session.newest
-            if after < 0:
-                return (0, session.geometry[step]) if step in session.geometry else None
-            if newest is not None and newest.number > after and step in newest.messages:
-                return newest.number, newest.messages[step]
-            return None
-
-        with self._changed:
-            self._changed.wait_for(lambda: session.error is not None or found() is not None, timeout_s)
-            if session.error is not None:
-                raise session.error
-            return found()
 
     def run(self, rig: Rig, calibration: Calibration | None, stop: Callable[[], bool]) -> None:
         """Play until live depth ends or `stop` says so. For the thread that owns the rig. Raises what devices raise.
@@ -279,7 +278,7 @@ class LiveRoom:
                 came = session.process.messages.recv()
             except (EOFError, OSError):
                 break
-            with self._changed:
+            with self._lock:
                 if isinstance(came, GeometryCame):
                     session.geometry.update(came.messages)
                 elif isinstance(came, DepthCame):
@@ -290,16 +289,16 @@ class LiveRoom:
                         _log.error("live depth failed", trace=came.trace)
                     else:
                         error = error_of(came.fault)
-                self._changed.notify_all()
+            session.tell()
         self._finish(session, error)
 
     def _finish(self, session: _Session, error: SlrigError) -> None:
-        with self._changed:
+        with self._lock:
             if session.error is None:
                 session.error = error
             if self._session is session:
                 self._session = None
-            self._changed.notify_all()
+        session.tell()
         session.process.close()
 
 

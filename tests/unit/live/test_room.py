@@ -1,0 +1,112 @@
+"""Who watches live depth: what each gets of it, and when its process and the rig hear of it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import threading
+from contextlib import suppress
+
+import pytest
+
+from slrig.devices import CameraInfo, ProjectorInfo, Trigger
+from slrig.errors import ConfigError, SlrigError
+from slrig.failure import job_failure
+from slrig.live.process import DepthCame, GeometryCame, LiveFailed
+from slrig.live.room import LiveOptions, LiveRoom, Viewer
+from slrig.model import CameraFormat
+from tests.unit.live.scene import CAMERA, PROJECTOR, calibration
+
+LEFT = CameraInfo("left", "l", "1", CameraFormat(CAMERA, 8), frozenset({Trigger.SOFTWARE}), (1e-4, 1.0), (1.0, 1.0))
+BEAMER = ProjectorInfo("p", "p", "1", PROJECTOR, False, 0.0, shades=True)
+
+
+class FakeProcess:
+    """Stands for `LiveProcess`; `says` sends what the real one would."""
+
+    def __init__(self, _task: object) -> None:
+        self.messages, self._far = multiprocessing.Pipe()
+        self.wanted: list[tuple[int, ...]] = []
+
+    def want(self, steps: tuple[int, ...]) -> None:
+        self.wanted.append(steps)
+
+    def says(self, message: object) -> None:
+        self._far.send(message)
+
+    def close(self) -> None:
+        # Also by two threads at once.
+        with suppress(OSError):
+            self._far.close()
+
+
+class Watching:
+    """A viewer, and how often it was told of news."""
+
+    def __init__(self, room: LiveRoom, step: int) -> None:
+        self._news = threading.Semaphore(0)
+        self.viewer: Viewer = room.watch(step, self._news.release)
+
+    def told(self) -> None:
+        assert self._news.acquire(timeout=10)
+
+    @property
+    def told_again(self) -> bool:
+        return self._news.acquire(blocking=False)
+
+
+@pytest.fixture
+def begun(monkeypatch: pytest.MonkeyPatch) -> tuple[LiveRoom, FakeProcess]:
+    made: list[FakeProcess] = []
+
+    def make(task: object) -> FakeProcess:
+        made.append(FakeProcess(task))
+        return made[-1]
+
+    monkeypatch.setattr("slrig.live.room.LiveProcess", make)
+    room = LiveRoom(lambda: None)
+    room.start(LiveOptions("left"), LEFT, BEAMER, calibration())
+    return room, made[0]
+
+
+def _came(number: int, *steps: int) -> DepthCame:
+    return DepthCame(number, {step: b"%d of %d" % (number, step) for step in steps}, {})
+
+
+def test_each_viewer_is_told_once_of_its_own_and_the_slow_one_gets_the_newest(
+    begun: tuple[LiveRoom, FakeProcess],
+) -> None:
+    room, process = begun
+    fine, coarse = Watching(room, 2), Watching(room, 4)
+    assert process.wanted == [(2,), (2, 4)]
+    process.says(GeometryCame({2: b"rays", 4: b"few rays"}))
+    for each in (fine, coarse):
+        each.told()
+    assert (fine.viewer.message(-1), coarse.viewer.message(-1)) == ((0, b"rays"), (0, b"few rays"))
+    for number in (1, 2):
+        process.says(_came(number, 2, 4))
+        fine.told()
+        assert fine.viewer.message(number - 1) == (number, b"%d of 2" % number)
+    assert coarse.viewer.message(0) == (2, b"2 of 4")
+    assert coarse.viewer.message(2) is None
+    assert not fine.told_again
+    with coarse.viewer:
+        pass
+    assert process.wanted[-1] == (2,)
+
+
+@pytest.mark.parametrize(
+    ("found", "told"),
+    [(ConfigError("nothing of it is seen"), "nothing of it is seen"), (KeyError("x"), "its process did")],
+    ids=["known", "unexpected"],
+)
+def test_why_the_process_cannot_go_on_is_told_to_who_watches(
+    begun: tuple[LiveRoom, FakeProcess], found: Exception, told: str
+) -> None:
+    room, process = begun
+    watching = Watching(room, 1)
+    process.says(LiveFailed(job_failure(found), "trace"))
+    process.close()
+    while room.wanted:
+        watching.told()
+    with pytest.raises(SlrigError, match=told):
+        watching.viewer.message(-1)
