@@ -103,6 +103,7 @@ class _Session:
         self.came_s: deque[float] = deque(maxlen=_RATE_OF)
         self.error: SlrigError | None = None
         self.playing = False
+        self.ending: threading.Timer | None = None
 
     @property
     def steps(self) -> tuple[int, ...]:
@@ -154,6 +155,8 @@ class LiveRoom:
         with self._lock:
             other = self._session
             if other is not None and other.options == options and other.task.calibration.digest == calibration.digest:
+                if not other.viewers:
+                    self._end_unless_watched(other)
                 return self.status()
             if other is not None and other.viewers:
                 message = (
@@ -204,6 +207,8 @@ class LiveRoom:
             own = session.task.step
             viewer = Viewer(self, session, own * max(1, -(-step // own)), told)
             session.viewers = [*session.viewers, viewer]
+            if session.ending is not None:
+                session.ending.cancel()
             # Not later, when another one's may have come first.
             session.process.want(session.steps)
         self._woken()
@@ -215,9 +220,8 @@ class LiveRoom:
         with self._lock:
             session.viewers = [each for each in session.viewers if each is not viewer]
             session.process.want(session.steps)
-            unwatched = not session.viewers
-        if unwatched:
-            self._end_unless_watched(session)
+            if not session.viewers:
+                self._end_unless_watched(session)
 
     def run(self, rig: Rig, calibration: Calibration | None, stop: Callable[[], bool]) -> None:
         """Play until live depth ends or `stop` says so. For the thread that owns the rig. Raises what devices raise.
@@ -231,9 +235,15 @@ class LiveRoom:
             message = "Another calibration came into use. Start live depth again (POST /live)."
             self._finish(session, LiveStateError(message))
             return
-        session.playing = True
         process, options = session.process, session.options
-        computed = rig.cameras[options.camera].info.limits.computed
+        camera = rig.cameras.get(options.camera)
+        if camera is None or camera.info.format != session.task.format:
+            found = "is gone" if camera is None else f"gives {camera.info.format.size} px now"
+            message = f"The rig changed: camera '{options.camera}' {found}. Start live depth again (POST /live)."
+            self._finish(session, LiveStateError(message))
+            return
+        session.playing = True
+        computed = camera.info.limits.computed
         next_s = 0.0
 
         def take(pattern: int, shot: Shot, begin_s: float, end_s: float) -> None:
@@ -254,13 +264,17 @@ class LiveRoom:
 
     def _end_unless_watched(self, session: _Session) -> None:
         def look() -> None:
-            if not session.viewers:
+            with self._lock:
+                if session.viewers or session.ending is not timer:
+                    return
                 message = (
                     f"The live depth had no viewer for {UNWATCHED_S:g} s, so it ended. Start it again (POST /live)."
                 )
                 self._finish(session, LiveStateError(message))
 
-        timer = threading.Timer(UNWATCHED_S, look)
+        if session.ending is not None:
+            session.ending.cancel()
+        session.ending = timer = threading.Timer(UNWATCHED_S, look)
         timer.daemon = True
         timer.start()
 

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import multiprocessing
 import threading
+from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from slrig.devices import CameraInfo, ProjectorInfo, Trigger
-from slrig.errors import ConfigError, SlrigError
+from slrig.errors import ConfigError, LiveStateError, SlrigError
 from slrig.failure import job_failure
 from slrig.live.process import DepthCame, GeometryCame, LiveFailed
 from slrig.live.room import LiveOptions, LiveRoom, Viewer
-from slrig.model import CameraFormat
+from slrig.model import CameraFormat, Size
 from tests.unit.live.scene import CAMERA, PROJECTOR, calibration
 
 LEFT = CameraInfo("left", "l", "1", CameraFormat(CAMERA, 8), frozenset({Trigger.SOFTWARE}), (1e-4, 1.0), (1.0, 1.0))
@@ -109,4 +113,57 @@ def test_why_the_process_cannot_go_on_is_told_to_who_watches(
     while room.wanted:
         watching.told()
     with pytest.raises(SlrigError, match=told):
+        watching.viewer.message(-1)
+
+
+class FakeTimer:
+    """Stands for `threading.Timer`: it fires when the test says so."""
+
+    made: list[FakeTimer]
+    daemon = False
+
+    def __init__(self, _after_s: float, function: Callable[[], None]) -> None:
+        self.fire = function
+        self.made.append(self)
+
+    def start(self) -> None:
+        """It fires when the test says so."""
+
+    def cancel(self) -> None:
+        """As a timer that fires at that moment all the same."""
+
+
+def test_only_the_time_since_the_last_viewer_left_ends_it(
+    begun: tuple[LiveRoom, FakeProcess], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    room, _ = begun
+    FakeTimer.made = []
+    monkeypatch.setattr("slrig.live.room.threading.Timer", FakeTimer)
+    for _ in range(2):
+        with Watching(room, 1).viewer:
+            pass
+    # Who begins anew has all the time to watch.
+    room.start(LiveOptions("left"), LEFT, BEAMER, calibration())
+    *earlier, last = FakeTimer.made
+    for each in earlier:
+        each.fire()
+    assert room.status().viewers == 0
+    last.fire()
+    with pytest.raises(LiveStateError, match="There is no live depth"):
+        room.status()
+
+
+@pytest.mark.parametrize(
+    ("cameras", "found"),
+    [({}, "'left' is gone"), ({"left": replace(LEFT, format=CameraFormat(Size(120, 90), 8))}, "'left' gives 120")],
+    ids=["gone", "another extent"],
+)
+def test_a_rig_that_changed_meanwhile_ends_it_and_says_so(
+    begun: tuple[LiveRoom, FakeProcess], cameras: dict[str, CameraInfo], found: str
+) -> None:
+    room, _ = begun
+    watching = Watching(room, 1)
+    rig: Any = SimpleNamespace(cameras={name: SimpleNamespace(info=info) for name, info in cameras.items()})
+    room.run(rig, calibration(), stop=lambda: False)
+    with pytest.raises(LiveStateError, match=found):
         watching.viewer.message(-1)
