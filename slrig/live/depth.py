@@ -326,6 +326,13 @@ class LiveDecoder:
         end_s, begin_s = max(end for _, end in times), min(begin for begin, _ in times)
         return DepthImage(depth, sigma, grey, state, end_s, end_s - begin_s, moved_mm, self._blur_px())
 
+    def forget(self) -> None:
+        """Count no frame that has come so far. Sums stay, as the frames that they are of do."""
+        self._seen[:], self._refused_in_a_row[:] = 0, 0
+        self._times = [None] * len(self._times)
+        self._noise = None
+        self._earlier.clear()
+
     def share_in_volume(self, points: NDArray[np.float64]) -> float | None:
         """Return the share of points (n, 3), mm in the camera's frame, within the volume that was calibrated; None if
         that is unknown.

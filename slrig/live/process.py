@@ -65,6 +65,11 @@ class FrameCame:
 
 
 @dataclass(frozen=True, slots=True)
+class PlayBegan:
+    """Parent to child: frames come again, after something else held the rig."""
+
+
+@dataclass(frozen=True, slots=True)
 class Wanted:
     """Parent to child: which steps, in pixels of the camera, viewers watch."""
 
@@ -129,6 +134,10 @@ class LiveProcess:
         self._frames[place] = image
         self._numbers[place] = self._number
         self._send(FrameCame(self._number, pattern, begin_s, end_s, time.monotonic()))
+
+    def begin(self) -> None:
+        """Say that frames come again after a pause."""
+        self._send(PlayBegan())
 
     def want(self, steps: tuple[int, ...]) -> None:
         """Have depth images made for these steps, and no others."""

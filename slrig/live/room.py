@@ -243,6 +243,7 @@ class LiveRoom:
             self._finish(session, LiveStateError(message))
             return
         session.playing = True
+        process.begin()
         computed = camera.info.limits.computed
         next_s = 0.0
 

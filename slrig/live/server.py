@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from slrig.capture import NEAR_SATURATION
 from slrig.live.depth import FARTHEST, NEAREST, DepthImage, LiveDecoder, LiveView, PixelState
-from slrig.live.process import PLACES, DepthCame, FrameCame, GeometryCame, LiveTask, Wanted
+from slrig.live.process import PLACES, DepthCame, FrameCame, GeometryCame, LiveTask, PlayBegan, Wanted
 from slrig.live.stream import depth_message, geometry_message
 
 _FACTS_POINTS = 9_000  # by which what an image says is computed
@@ -78,6 +78,9 @@ class LiveServer:
         if isinstance(message, Wanted):
             self._want(message.steps)
             return False
+        if isinstance(message, PlayBegan):
+            for each in filter(None, (self._decoder, self._next)):
+                each.forget()
         if not isinstance(message, FrameCame):
             return False
         place, self._numbers[PLACES] = message.number % PLACES, message.number

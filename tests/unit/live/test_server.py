@@ -12,7 +12,7 @@ from slrig.client.live import LiveFrame, frames, split_messages
 from slrig.devices import ProjectorInfo
 from slrig.errors import ConfigError
 from slrig.live.plan import live_plan
-from slrig.live.process import PLACES, DepthCame, FrameCame, GeometryCame, LiveTask, Wanted
+from slrig.live.process import PLACES, DepthCame, FrameCame, GeometryCame, LiveTask, PlayBegan, Wanted
 from slrig.live.server import LiveServer
 from slrig.model import Axis, CameraFormat, Region
 from tests.unit.live.scene import CAMERA, EXPOSURE_S, FRAME_S, PROJECTOR, Photographer, Plane, calibration
@@ -27,7 +27,7 @@ class Bench:
         self._memory, self._numbers = np.zeros((PLACES, *CAMERA.shape), np.uint8), [0] * (PLACES + 1)
         task = LiveTask(self.plan, calibration(), "left", CameraFormat(CAMERA, 8), **options)
         self._server = LiveServer(far, task, self._memory, self._numbers)
-        self._photographer = Photographer(Plane(), self.plan.patterns)
+        self.photographer = Photographer(Plane(), self.plan.patterns)
         self._geometry: dict[int, bytes] = {}
         self._number = 0
 
@@ -39,6 +39,10 @@ class Bench:
             assert isinstance(came, GeometryCame)
             self._geometry.update(came.messages)
 
+    def begin(self) -> None:
+        self._pipe.send(PlayBegan())
+        self._server.turn()
+
     def shoot(self, count: int) -> list[dict[int, LiveFrame]]:
         """Give so many frames; return the images of each by step, none where there is none yet."""
         made: list[dict[int, LiveFrame]] = []
@@ -46,7 +50,7 @@ class Bench:
             self._number += 1
             pattern, place = self._number % len(self.plan.patterns), self._number % PLACES
             begin_s = self._number * FRAME_S
-            self._memory[place] = self._photographer.frame(pattern, 0.0)
+            self._memory[place] = self.photographer.frame(pattern, 0.0)
             self._numbers[place] = self._number
             self._pipe.send(FrameCame(self._number, pattern, begin_s, begin_s + EXPOSURE_S, 0.0))
             self._server.turn()
@@ -77,6 +81,21 @@ def test_a_viewer_of_finer_points_comes_and_goes_and_nobodys_picture_stands_stil
     assert np.nanmax(np.abs(coarse.depth_mm - alone.depth_mm)) < 8 * np.nanmedian(alone.sigma_mm)
     bench.want(4)
     assert all(4 in each for each in bench.shoot(twice))
+
+
+def test_no_depth_is_made_of_frames_from_before_a_scan_and_after_it() -> None:
+    bench = Bench()
+    bench.want(1)
+    twice = 2 * len(bench.plan.patterns)
+    assert 1 in bench.shoot(twice)[-1]
+    bench.begin()
+    plane = bench.photographer.plane = Plane((0.3, 0.1, -1.0))
+    *before, last = bench.shoot(twice)
+    assert not any(before)
+    frame = last[1]
+    wrong = np.abs(frame.depth_mm - plane.depth_mm(bench.photographer.camera, 0.0)) > 8 * frame.sigma_mm
+    assert wrong.mean() < 1e-3
+    assert (frame.state == 0).mean() > 0.8
 
 
 def test_a_region_that_the_camera_does_not_see_is_told_so() -> None:
