@@ -35,10 +35,10 @@ _STREAM: dict[int | str, dict[str, Any]] = {
         "of the bytes after it), the text, the bytes. `kind` is `geometry` first (deflated float32 (height, "
         "width, 2), x/z and y/z of each pixel; `part_px`, left, top, right and bottom of what is decoded of the "
         "camera's image), then `depth` (deflated planes of one byte a pixel: low and high bytes of the "
-        "differences along each row of q, modulo 65536; a code of σ; `state`; grey), `wait` when none comes, and "
-        "`end` with its `reason`. Depth along the camera's axis: near_mm + (q − 1) unit_mm, none where q is 0; σ: "
-        "0.0001 mm · 1.05^(code − 1), none where it is 0; state: 0 measured, 1 moved, 2 saturated, 3 dark, 4 "
-        "unclear, 5 unseen, 6 outside the region.",
+        "differences along each row of q, modulo 65536; a code of σ; `state`; grey), `wait` when none comes and "
+        "`end`, each with its `reason`. Depth along the camera's axis: near_mm + (q − 1) unit_mm, none where q is "
+        "0; σ: 0.0001 mm · 1.05^(code − 1), none where it is 0; state: 0 measured, 1 moved, 2 saturated, 3 dark, "
+        "4 unclear, 5 unseen, 6 outside the region.",
         "content": {_TYPE: {"schema": {"type": "string", "format": "binary"}}},
     }
 }
@@ -140,7 +140,7 @@ async def _messages(viewer: Viewer, news: asyncio.Event) -> AsyncIterator[bytes]
                     await news.wait()
             except TimeoutError:
                 # Whoever has gone is noticed by it.
-                yield message({"kind": "wait"}, b"")
+                yield message({"kind": "wait", "reason": viewer.waits_for}, b"")
 
 
 def _body(status: LiveStatus) -> LiveBody:

@@ -86,6 +86,13 @@ class DepthCame:
 
 
 @dataclass(frozen=True, slots=True)
+class NoDepth:
+    """Child to parent: frames come, and make no depth image for now. cause : in words."""
+
+    cause: str
+
+
+@dataclass(frozen=True, slots=True)
 class GeometryCame:
     """Child to parent: the first message for those who watch a step."""
 

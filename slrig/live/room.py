@@ -17,7 +17,7 @@ from slrig.errors import CalibrationError, LiveStateError, SlrigError, WorkerLos
 from slrig.failure import UNEXPECTED, error_of
 from slrig.live.plan import live_plan
 from slrig.live.player import play
-from slrig.live.process import DepthCame, GeometryCame, LiveFailed, LiveProcess, LiveTask
+from slrig.live.process import DepthCame, GeometryCame, LiveFailed, LiveProcess, LiveTask, NoDepth
 from slrig.model import Calibration, Region, Shot, triangulated_axis
 
 UNWATCHED_S = 10.0
@@ -81,6 +81,18 @@ class Viewer:
             return newest.number, newest.messages[self.step]
         return None
 
+    @property
+    def waits_for(self) -> str:
+        """Why there is no message, in words."""
+        session = self.session
+        if not session.playing:
+            return "The picture comes when the rig is free."
+        if session.cause is not None:
+            return f"No depth comes: {session.cause}."
+        if session.newest is None:
+            return "The first depth image is on its way."
+        return "No depth image comes at the moment."
+
     def __enter__(self) -> Self:
         return self
 
@@ -103,6 +115,7 @@ class _Session:
         self.came_s: deque[float] = deque(maxlen=_RATE_OF)
         self.error: SlrigError | None = None
         self.playing = False
+        self.cause: str | None = None
         self.ending: threading.Timer | None = None
 
     @property
@@ -299,6 +312,9 @@ class LiveRoom:
                 elif isinstance(came, DepthCame):
                     session.newest = came
                     session.came_s.append(time.monotonic())
+                    session.cause = None
+                elif isinstance(came, NoDepth):
+                    session.cause = came.cause
                 elif isinstance(came, LiveFailed):
                     if came.fault.code == UNEXPECTED:
                         _log.error("live depth failed", trace=came.trace)

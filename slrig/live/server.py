@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from slrig.capture import NEAR_SATURATION
 from slrig.live.depth import FARTHEST, NEAREST, DepthImage, LiveDecoder, LiveView, PixelState
-from slrig.live.process import PLACES, DepthCame, FrameCame, GeometryCame, LiveTask, PlayBegan, Wanted
+from slrig.live.process import PLACES, DepthCame, FrameCame, GeometryCame, LiveTask, NoDepth, PlayBegan, Wanted
 from slrig.live.stream import depth_message, geometry_message
 
 _FACTS_POINTS = 9_000  # by which what an image says is computed
+_TELL_S = 1.0  # without an image, until it is said why
 _FEWEST_POINTS = 60_000  # that are decoded: the noise is told by them
 _LEAST_POINTS = 100
 _PLANE_TURNS = 3
@@ -39,6 +40,8 @@ class LiveServer:
         self._left_out: Counter[str] = Counter()
         self._lost, self._made = 0, 0
         self._came_s = 0.0
+        self._cause: str | None = None
+        self._told_s = time.monotonic()
 
     def run(self) -> None:
         """Serve until the parent's end of the pipe is gone. Raises EOFError or ConnectionError then."""
@@ -51,7 +54,10 @@ class LiveServer:
         # Newest frame wins: all that have come are taken, and one depth image is made of them.
         while self._pipe.poll():
             came = self._receive(self._pipe.recv()) or came
-        if not came or not self._steps:
+        if not self._steps:
+            return
+        if not came:
+            self._tell()
             return
         image = None if self._next is None else self._next.depth()
         if self._next is not None and image is not None:
@@ -60,8 +66,11 @@ class LiveServer:
             image = self._decoder.depth()
         if image is None:
             if self._decoder.contradiction is not None:
-                self._left_out[self._decoder.contradiction] += 1
+                self._cause = self._decoder.contradiction
+                self._left_out[self._cause] += 1
+            self._tell()
             return
+        self._cause, self._told_s = None, time.monotonic()
         self._made += 1
         facts = {**depth_facts(image, self._decoder), "number": self._made, "left_out": sum(self._left_out.values()),
                  "lost": self._lost, "causes": dict(self._left_out.most_common(3))}  # fmt: skip
@@ -79,6 +88,7 @@ class LiveServer:
             self._want(message.steps)
             return False
         if isinstance(message, PlayBegan):
+            self._cause = None
             for each in filter(None, (self._decoder, self._next)):
                 each.forget()
         if not isinstance(message, FrameCame):
@@ -97,8 +107,15 @@ class LiveServer:
         if self._next is not None:
             self._next.add(message.pattern, image, message.begin_s, message.end_s)
         if cause is not None:
+            self._cause = f"a frame of pattern {message.pattern + 1} was left out: {cause}"
             self._left_out[cause] += 1
         return cause is None
+
+    def _tell(self) -> None:
+        """Say why there is no image, where there has been none for some time."""
+        if self._cause is not None and time.monotonic() - self._told_s > _TELL_S:
+            self._told_s = time.monotonic()
+            self._pipe.send(NoDepth(self._cause))
 
     def _want(self, steps: tuple[int, ...]) -> None:
         """Make depth images for these steps from now on, and decode no more than they show."""

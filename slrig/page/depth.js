@@ -119,7 +119,7 @@ async function watch(size_px, shown, signal, show, say) {
       if (problem) throw problem;
       if (head.kind === "end") throw new Error(head.reason);
       waits = head.kind === "wait" ? waits + 1 : 0;
-      if (waits > 3) say("The picture comes when the rig is free.");
+      if (waits > 3) say(head.reason);
       if (head.kind === "geometry") {
         const [left, top, right, bottom] = head.part_px;
         size = [right - left, bottom - top];

@@ -15,7 +15,7 @@ import pytest
 from slrig.devices import CameraInfo, ProjectorInfo, Trigger
 from slrig.errors import ConfigError, LiveStateError, SlrigError
 from slrig.failure import job_failure
-from slrig.live.process import DepthCame, GeometryCame, LiveFailed
+from slrig.live.process import DepthCame, GeometryCame, LiveFailed, NoDepth
 from slrig.live.room import LiveOptions, LiveRoom, Viewer
 from slrig.model import CameraFormat, Size
 from tests.unit.live.scene import CAMERA, PROJECTOR, calibration
@@ -30,9 +30,13 @@ class FakeProcess:
     def __init__(self, _task: object) -> None:
         self.messages, self._far = multiprocessing.Pipe()
         self.wanted: list[tuple[int, ...]] = []
+        self.begun = 0
 
     def want(self, steps: tuple[int, ...]) -> None:
         self.wanted.append(steps)
+
+    def begin(self) -> None:
+        self.begun += 1
 
     def says(self, message: object) -> None:
         self._far.send(message)
@@ -167,3 +171,28 @@ def test_a_rig_that_changed_meanwhile_ends_it_and_says_so(
     room.run(rig, calibration(), stop=lambda: False)
     with pytest.raises(LiveStateError, match=found):
         watching.viewer.message(-1)
+
+
+def test_who_waits_learns_for_what(begun: tuple[LiveRoom, FakeProcess], monkeypatch: pytest.MonkeyPatch) -> None:
+    room, process = begun
+    watching = Watching(room, 1)
+    assert "when the rig is free" in watching.viewer.waits_for
+    said: list[str] = []
+
+    def play(*_: object, **__: object) -> None:
+        said.append(watching.viewer.waits_for)
+        process.says(NoDepth("the frames came in another order"))
+        watching.told()
+        said.append(watching.viewer.waits_for)
+        process.says(_came(1, 1))
+        watching.told()
+        said.append(watching.viewer.waits_for)
+
+    monkeypatch.setattr("slrig.live.room.play", play)
+    rig: Any = SimpleNamespace(cameras={"left": SimpleNamespace(info=LEFT)})
+    room.run(rig, calibration(), stop=lambda: False)
+    first, contradicted, later = said
+    assert "on its way" in first
+    assert contradicted == "No depth comes: the frames came in another order."
+    assert later == "No depth image comes at the moment."
+    assert process.begun == 1

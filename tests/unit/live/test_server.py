@@ -12,7 +12,7 @@ from slrig.client.live import LiveFrame, frames, split_messages
 from slrig.devices import ProjectorInfo
 from slrig.errors import ConfigError
 from slrig.live.plan import live_plan
-from slrig.live.process import PLACES, DepthCame, FrameCame, GeometryCame, LiveTask, PlayBegan, Wanted
+from slrig.live.process import PLACES, DepthCame, FrameCame, GeometryCame, LiveTask, NoDepth, PlayBegan, Wanted
 from slrig.live.server import LiveServer
 from slrig.model import Axis, CameraFormat, Region
 from tests.unit.live.scene import CAMERA, EXPOSURE_S, FRAME_S, PROJECTOR, Photographer, Plane, calibration
@@ -30,6 +30,7 @@ class Bench:
         self.photographer = Photographer(Plane(), self.plan.patterns)
         self._geometry: dict[int, bytes] = {}
         self._number = 0
+        self.said: list[str] = []
 
     def want(self, *steps: int) -> None:
         self._pipe.send(Wanted(steps))
@@ -57,6 +58,9 @@ class Bench:
             made.append({})
             while self._pipe.poll():
                 came = self._pipe.recv()
+                if isinstance(came, NoDepth):
+                    self.said.append(came.cause)
+                    continue
                 assert isinstance(came, DepthCame)
                 for step, message in came.messages.items():
                     made[-1][step] = next(frames(split_messages([self._geometry[step] + message])))
@@ -96,6 +100,16 @@ def test_no_depth_is_made_of_frames_from_before_a_scan_and_after_it() -> None:
     wrong = np.abs(frame.depth_mm - plane.depth_mm(bench.photographer.camera, 0.0)) > 8 * frame.sigma_mm
     assert wrong.mean() < 1e-3
     assert (frame.state == 0).mean() > 0.8
+
+
+def test_frames_that_make_no_depth_for_some_time_say_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("slrig.live.server._TELL_S", 0.0)
+    bench = Bench()
+    bench.want(1)
+    # The camera is a frame late from the first one on.
+    bench.photographer.patterns = (*bench.plan.patterns[-1:], *bench.plan.patterns[:-1])
+    bench.shoot(3 * len(bench.plan.patterns))
+    assert "frames may be one pattern late" in bench.said[-1]
 
 
 def test_a_region_that_the_camera_does_not_see_is_told_so() -> None:
