@@ -29,7 +29,8 @@ class LiveFrame:
     (h, w) uint8: 0 measured, 1 moved (its frames do not show one surface, and the depth may be off by `moved_mm` of
     `facts`), 2 saturated, 3 dark, 4 unclear, 5 unseen by camera or projector, 6 outside the region. grey : (h, w)
     uint8. directions : (h, w, 2) float32, x/z and y/z of each ray in the camera. facts : number, time_s, window_s,
-    age_s (from the arrival of the newest frame to the image), shares by state, distance_mm, tilt_deg and more.
+    age_s (from the arrival of the newest frame to the image), came_s (that arrival, by the monotonic clock of the
+    service), shares by state, distance_mm, tilt_deg and more.
     """
 
     depth_mm: NDArray[np.float32]

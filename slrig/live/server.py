@@ -74,7 +74,8 @@ class LiveServer:
         self._made += 1
         facts = {**depth_facts(image, self._decoder), "number": self._made, "left_out": sum(self._left_out.values()),
                  "lost": self._lost, "causes": dict(self._left_out.most_common(3))}  # fmt: skip
-        facts["age_s"] = round(time.monotonic() - self._came_s, 4)
+        age_s = time.monotonic() - self._came_s
+        facts.update(age_s=round(age_s, 4), came_s=round(self._came_s, 4))
         made = {
             each: depth_message(image, each // self._decoder.step, self._near_mm, self._unit_mm, facts)
             for each in self._steps

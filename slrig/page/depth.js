@@ -46,6 +46,8 @@ export function LiveDepth({camera, size_px, options}) {
       paint(depth.current, image, depthColour(image));
       paint(grey.current, image, (at) => [image.grey[at], image.grey[at], image.grey[at]]);
       view.current?.show(image);
+      // For the bench: when the newest frame of what is drawn came.
+      depth.current.dataset.came = image.facts.came_s;
       if (performance.now() - told > FACTS_MS) {
         told = performance.now();
         setFacts(image.facts);
@@ -112,8 +114,23 @@ async function watch(size_px, shown, signal, show, say) {
     const step = stepOf(size, shown());
     let rays = null;
     let waits = 0;
-    let busy = false;
+    let newest = null;
+    let drawing = false;
     let problem = null;
+    // The newest image counts: one that comes while another is drawn takes the place of those before it.
+    const draw = async () => {
+      drawing = true;
+      try {
+        while (newest) {
+          const {head, body} = newest;
+          newest = null;
+          show(decoded(head, new Uint8Array(await inflated(body)), rays));
+        }
+      } catch (found) {
+        problem = found;
+      }
+      drawing = false;
+    };
     again = false;
     for await (const {head, body} of messages(`/live/depth?step=${step}`, signal)) {
       if (problem) throw problem;
@@ -128,14 +145,9 @@ async function watch(size_px, shown, signal, show, say) {
       // The limits leave a part of the picture, or the window has another size.
       again = stepOf(size, shown()) !== step;
       if (again) break;
-      // The newest image counts: one that comes while another is drawn is passed over.
-      if (head.kind === "depth" && rays && !busy) {
-        busy = true;
-        inflated(body.slice()).then((bytes) => show(decoded(head, new Uint8Array(bytes), rays))).catch((found) => {
-          problem = found;
-        }).finally(() => {
-          busy = false;
-        });
+      if (head.kind === "depth" && rays) {
+        newest = {head, body};
+        if (!drawing) draw();
       }
     }
   }
@@ -202,9 +214,12 @@ function paint(canvas, {width, height}, colour) {
   if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, {width, height});
   const context = canvas.getContext("2d");
   const picture = context.createImageData(width, height);
-  for (let at = 0; at < width * height; at += 1) {
-    const [red, green, blue] = colour(at);
-    picture.data.set([red, green, blue, 255], 4 * at);
+  for (let at = 0, byte = 0; at < width * height; at += 1) {
+    const shade = colour(at);
+    picture.data[byte++] = shade[0];
+    picture.data[byte++] = shade[1];
+    picture.data[byte++] = shade[2];
+    picture.data[byte++] = 255;
   }
   context.putImageData(picture, 0, 0);
 }

@@ -3,7 +3,8 @@
     pytest tests/bench/test_live.py -s
 
 A rendered rig without pauses, all rays decoded, one viewer of each third. Processor time is that of service (which
-renders the frames), worker and live process together; the delay is from a frame's arrival to its depth image.
+renders the frames), worker and live process together; the delay is from a frame's arrival to its depth image. In a
+browser without a GPU it goes on to the screen: to the picture after the one in which the canvases were drawn.
 """
 
 from __future__ import annotations
@@ -17,8 +18,12 @@ import psutil
 
 from slrig.client import Client
 from slrig.client.live import split_messages
-from tests.e2e.conftest import KEY, Start
+from tests.e2e.conftest import KEY, Start, browser
+from tests.e2e.page.conftest import Visit, visit
 
+__all__ = ["browser", "visit"]
+
+LATEST_S = 0.15
 SECONDS, SHORT_S, VIEWERS = 60.0, 10.0, 20
 RIG = """
 name = "large"
@@ -108,3 +113,43 @@ def test_depth_images_a_second_their_cost_and_their_delay(start: Start, tmp_path
         f"{after_mb - before_mb:+.0f} MB at the end; processes gone {time.monotonic() - killed:.2f} s after a kill"
     )
     assert count / took_s > 10
+
+
+WATCHED = """async ([ahead_ms, lasts_ms]) => {
+  const canvas = document.querySelector("canvas[data-came]");
+  const delays = [];
+  for (let begun = performance.now(), last = null; performance.now() - begun < lasts_ms;) {
+    await new Promise(requestAnimationFrame);
+    const {came} = canvas.dataset;
+    if (came !== last) {
+      await new Promise(requestAnimationFrame);
+      delays.push((performance.timeOrigin + performance.now() - ahead_ms) / 1000 - came);
+    }
+    last = came;
+  }
+  return delays;
+}"""
+
+
+def test_how_soon_the_page_shows_what_came(start: Start, tmp_path: Path, visit: Visit) -> None:
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "rig.toml").write_text(RIG)
+    service = start(tmp_path / "rig.toml")
+    process = psutil.Process(service.process.pid)
+    page = visit(service, "scan")
+    page.get_by_role("button", name="Depth", exact=True).click()
+    page.locator("canvas[data-came]").wait_for()
+    with service.client() as client:
+        while client.live.status()["facts"]["number"] < 40:
+            page.wait_for_timeout(500)
+        (begun_s, _), begun, first = spent(process), time.monotonic(), client.live.status()["facts"]["number"]
+        ahead_ms = 1e3 * (time.time() - time.monotonic())  # noqa: TID251 - the browser has the clock of the day
+        delays_s = page.evaluate(WATCHED, [ahead_ms, 1e3 * SECONDS])
+        (ended_s, _), took_s, last = spent(process), time.monotonic() - begun, client.live.status()["facts"]["number"]
+    least, middle, most = np.quantile(delays_s, [0.05, 0.5, 0.95]) * 1e3
+    print(  # noqa: T201
+        f"\nbeside an open page: {(last - first) / took_s:.1f} images a second, {(ended_s - begun_s) / took_s:.2f} cores"
+        f"; the page shows {len(delays_s) / took_s:.1f} a second, {middle:.0f} ms after the newest frame of each came "
+        f"(5 and 95 %: {least:.0f} and {most:.0f})"
+    )
+    assert np.median(delays_s) < LATEST_S
