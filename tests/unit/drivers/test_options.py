@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from drivers import depthai, genicam, picamera2
+from drivers import depthai, genicam, picamera2, serial_projector
 from drivers.depthai.library import ENVIRONMENT, load_depthai
 from drivers.genicam.aravis import install_command
 from drivers.genicam.aravis import load_aravis as aravis
@@ -42,7 +43,6 @@ def test_every_driver_of_slrig_describes_its_options() -> None:
 def test_every_option_has_a_meaning_in_a_sentence(driver: str) -> None:
     model = option_model(driver)
     assert model is not None
-    assert driver_kinds(driver)
     told = dict(properties(model.model_json_schema()))
     assert told
     for name, part in told.items():
@@ -68,9 +68,25 @@ def test_every_option_has_a_meaning_in_a_sentence(driver: str) -> None:
             {"socket": "left", "fsp": 3, "fps": 0, "focus": 300},
             ("device: missing", "'CAM_A'", "fsp: unknown key; did you mean 'fps'", "fps: ", "focus: "),
         ),
+        (
+            "dlpc350",
+            {"patern": "p", "led": "ultraviolet", "hold_s": 1.0, "trigger_delay_us": 5.0},
+            ("patern: unknown key; did you mean 'patterns'?", "patterns: missing", "led: ", "hold_s: ", "5.0"),
+        ),
+        ("kms", {"outputs": "A", "refresh_hz": 0, "display": ":0"}, ("output: missing", "refresh_hz", "display")),
+        (
+            "serial_projector",
+            {"port": "", "baud": 1, "watchdog": 1.0, "max_duty": 2.0},
+            ("port", "baud", "did you mean 'watchdog_s'?", "max_duty"),
+        ),
+        (
+            "grbl_turntable",
+            {"axis": "W", "sped_deg_s": 3.0, "units_per_deg": 0.0},
+            ("port", "axis", "sped_deg_s", "units_per_deg"),
+        ),
     ],
 )
-def test_every_fault_of_a_cameras_table_is_in_one_message(
+def test_every_fault_of_a_table_is_in_one_message(
     driver: str, table: dict[str, object], words: tuple[str, ...]
 ) -> None:
     model = option_model(driver)
@@ -78,6 +94,14 @@ def test_every_fault_of_a_cameras_table_is_in_one_message(
     with pytest.raises(ConfigError) as refused:
         validate(model, table, "the table")
     assert [each for each in words if each not in str(refused.value)] == []
+
+
+@pytest.mark.parametrize("driver", sorted(SHIPPED))
+def test_a_driver_opens_nothing_by_a_wrong_table(driver: str) -> None:
+    for kind in driver_kinds(driver):
+        (entry,) = importlib.metadata.entry_points(group=f"slrig.{kind}s", name=driver)
+        with pytest.raises(ConfigError, match="colour: unknown key"):
+            entry.load()(*["left"] * (kind == "camera"), {"colour": "none such"}, Path())
 
 
 def test_a_finders_id_is_taken_by_device_or_by_what_a_model_marks() -> None:
@@ -138,6 +162,12 @@ MISSING: list[tuple[str, tuple[Callable[[], object], ...], str, str]] = [
         "harvesters",
         "pip install 'slrig[gentl]'",
     ),
+    (
+        "serial",
+        (serial_projector.find_devices, lambda: serial_projector.open_projector({"port": "/dev/ttyACM0"}, Path())),
+        "not installed",
+        "pip install 'slrig[serial]'",
+    ),
 ]
 
 
@@ -150,7 +180,8 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(
     for loaded in LOADED:
         loaded.cache_clear()
     # None in this table makes an import fail, as a package that is not installed does.
-    monkeypatch.setitem(sys.modules, module, None)
+    for name in {module, *(name for name in sys.modules if name.startswith(f"{module}."))}:
+        monkeypatch.setitem(sys.modules, name, None)
     for call in calls:
         with pytest.raises(LibraryMissingError, match=words) as missing:
             call()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -324,15 +323,6 @@ def test_each_change_of_picture_swaps_the_buffer(
     tables = build_tables(places, (LedColour.RED,) * len(places), dark_between=False)
     assert [tables.patterns[3 * i + 2] >> 2 & 1 for i in range(len(places))] == swaps
     assert (list(tables.images), tables.counts, tables.length) == (images, counts, len(places))
-
-
-def test_all_faults_of_the_options_are_reported_at_once() -> None:
-    options: dict[str, Any] = {"patern": "p", "led": "ultraviolet", "hold_s": 1.0, "trigger_delay_us": 5.0}
-    with pytest.raises(ConfigError) as refused:
-        validate(Dlpc350EngineOptions, options, "the table")
-    text = str(refused.value)
-    for words in ("patern: unknown key; did you mean 'patterns'?", "patterns: missing", "led: ", "hold_s: ", "5.0"):
-        assert words in text
 
 
 def test_the_led_current_is_limited() -> None:

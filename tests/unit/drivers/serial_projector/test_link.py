@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import random
-import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +12,6 @@ from types import SimpleNamespace
 import pytest
 
 from drivers.serial_port import resolve_port
-from drivers.serial_projector import find_devices, open_projector
 from drivers.serial_projector.client import MAX_DRIFT, BoxClock
 from drivers.serial_projector.device import wire
 from drivers.serial_projector.link import (
@@ -34,7 +32,7 @@ from drivers.serial_projector.link import (
     find_ports,
     parse_line,
 )
-from slrig.errors import DeviceGoneError, DeviceStateError, LibraryMissingError
+from slrig.errors import DeviceGoneError, DeviceStateError
 from tests.unit.drivers.serial_projector.line import Noise
 from tests.virtual_clock import VirtualClock
 
@@ -352,12 +350,3 @@ def test_usb_ports_are_found_by_lasting_names_and_not_opened(ports: Path) -> Non
 def test_names_that_are_no_link_are_left_as_they_are() -> None:
     for name in ("/dev/ttyACM0", "COM3", "socket://localhost:4000", "usb-none"):
         assert resolve_port(name) == name
-
-
-def test_without_pyserial_the_driver_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ["serial", *(name for name in sys.modules if name.startswith("serial."))]:
-        monkeypatch.setitem(sys.modules, name, None)
-    for call in (find_devices, lambda: open_projector({"port": "/dev/ttyACM0"}, Path())):
-        with pytest.raises(LibraryMissingError) as missing:
-            call()
-        assert missing.value.install == "pip install 'slrig[serial]'"

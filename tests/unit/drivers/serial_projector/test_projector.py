@@ -21,7 +21,6 @@ from drivers.serial_projector.link import BoxLink, SequenceMode
 from drivers.serial_projector.projector import SerialProjector
 from slrig.devices import StoredPatternProjector
 from slrig.errors import (
-    ConfigError,
     DeviceBusyError,
     DeviceError,
     DeviceGoneError,
@@ -205,12 +204,6 @@ def test_brightness_that_the_box_cannot_keep_is_refused(bench: Bench) -> None:
     bench.engine.light.dims = True
     bench.open(brightness=0.5)
     assert bench.engine.light.bright == 500
-
-
-def test_options_are_checked_all_at_once() -> None:
-    with pytest.raises(ConfigError) as told:
-        open_projector({"port": "", "baud": 1, "watchdog": 1.0, "max_duty": 2.0}, Path())
-    assert all(each in str(told.value) for each in ("port", "baud", "did you mean 'watchdog_s'?", "max_duty"))
 
 
 def test_the_light_stays_for_as_long_as_the_host_gives_signs_of_life(bench: Bench) -> None:

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from drivers.serial_turntable import open_grbl, open_turntable
-from slrig.errors import ConfigError, DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
+from drivers.serial_turntable import open_turntable
+from slrig.errors import DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from tests.unit.drivers.serial_turntable.controllers import Board, GrblBoard, LineBoard
 
 X = {"axis": "X"}
@@ -237,9 +237,6 @@ def test_a_controller_that_falls_silent_is_given_up_and_one_that_is_pulled_is_go
     table.close()
 
 
-def test_wrong_options_are_reported_together() -> None:
-    with pytest.raises(ConfigError) as caught:
-        open_grbl({"axis": "W", "sped_deg_s": 3.0, "units_per_deg": 0.0}, Path())
-    assert all(key in str(caught.value) for key in ("port", "axis", "sped_deg_s", "units_per_deg"))
+def test_a_port_without_a_table_says_what_to_do() -> None:
     with pytest.raises(DeviceGoneError, match="plug the turntable in"):
         open_turntable({"port": "/dev/ttyNONE"}, Path())
