@@ -17,7 +17,6 @@ from slrig.capture.sequencer import capture
 from slrig.devices import CameraSettings, Rig
 from slrig.doctor.doctor import Diagnosis, examine
 from slrig.doctor.light import Severity
-from slrig.errors import UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 from tests.contract.stage import Stage, StagedProjector
 from tests.contract.suite import whole_scan
@@ -134,11 +133,3 @@ def test_scan_at_another_exposure_than_the_latency_was_measured_at_takes_no_wron
         scanning = replace(rig, settings={"left": CameraSettings(scanned_s)}, synchronisation=found)
         device.stage.scene = replace(device.stage.scene, white=0.5 * 0.01 / scanned_s)
         assert wrong_frames(scanning, device, whole_scan(SIZE, period_px=8, line_width_px=1)) == []
-
-
-def test_a_lens_with_a_motor_is_not_opened_without_its_place() -> None:
-    with (
-        pytest.raises(UnsupportedByDeviceError, match="focus = 30 is where it stands now"),
-        bench(replace(HABITS["moves its lens at the start, and is slow then"], options={"focus": None})),
-    ):
-        pass

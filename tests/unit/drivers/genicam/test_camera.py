@@ -399,25 +399,6 @@ def test_a_trigger_gives_one_frame_whose_exposure_is_where_it_says(
         camera.close()
 
 
-def test_a_pulse_during_the_readout_of_the_frame_before_is_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    # The camera ignores it as it comes from the maker.
-    memory = MemoryCamera(Stage(scene()))
-    seen = memory.stage.exposed
-
-    def read_out(*times: int, gain: float) -> Pixels:
-        if len(memory.exposures) < 3:
-            memory.pulse()
-        return seen(*times, gain=gain)
-
-    monkeypatch.setattr(memory.stage, "exposed", read_out)
-    with gentl_bench.serving(memory) as producer:
-        camera = gentl_bench.opened(producer)
-        camera.arm(3, Trigger.HARDWARE)
-        memory.pulse()
-        assert [camera.read(0, LONG_S).sequence_number for _ in range(3)] == [0, 1, 2]
-        camera.close()
-
-
 def test_no_wait_of_gentl_keeps_other_threads_waiting() -> None:
     with gentl_bench.serving(MemoryCamera(Stage(scene()))) as producer:
         camera = gentl_bench.opened(producer)
