@@ -77,8 +77,8 @@ INTERNAL = 0
 _BIT_DEPTH = 1
 
 
-MIN_EXPOSURE_US = {1: 235, 2: 700, 3: 1570, 4: 1700, 5: 2000, 6: 2500, 7: 4500, 8: 8333}
-"""Shortest exposure by bit depth."""
+_MIN_EXPOSURE_US = 235
+"""Shortest exposure of a pattern of 1 bit."""
 MAX_EXPOSURE_US = 200_000_000
 DARK_US = 230
 """Shortest dark time of a pattern that does not last its whole period: the mirrors are cleared."""
@@ -148,7 +148,7 @@ def play_timing(exposure_s: float, period_s: float, *, margin_s: float, duty_lim
     UnsupportedByDeviceError if the engine does not support it, or the duty limit forbids it.
     """
     period_us = round(period_s * 1e6)
-    wanted_us = light_duration_us(exposure_s, period_s, margin_s=margin_s, least_us=MIN_EXPOSURE_US[1])
+    wanted_us = light_duration_us(exposure_s, period_s, margin_s=margin_s, least_us=_MIN_EXPOSURE_US)
     # If the dark time does not fit, the light lasts for the whole period.
     timing = Timing(wanted_us if wanted_us <= period_us - DARK_US else period_us, period_us)
     check_timing(timing)
@@ -156,15 +156,12 @@ def play_timing(exposure_s: float, period_s: float, *, margin_s: float, duty_lim
     return timing
 
 
-def check_timing(timing: Timing, *, bit_depth: int = 1) -> None:
+def check_timing(timing: Timing) -> None:
     """Raise UnsupportedByDeviceError if the engine does not support this timing; the message names the rule."""
     exposure_us, period_us = timing.exposure_us, timing.period_us
     requested = f"requested an exposure of {exposure_us} µs and a period of {period_us} µs"
-    least_us = MIN_EXPOSURE_US[bit_depth]
-    if exposure_us < least_us:
-        message = (
-            f"{requested}: the shortest exposure of a {bit_depth}-bit pattern is {least_us} µs; lengthen exposure_s"
-        )
+    if exposure_us < _MIN_EXPOSURE_US:
+        message = f"{requested}: the shortest exposure of a 1-bit pattern is {_MIN_EXPOSURE_US} µs; lengthen exposure_s"
         raise UnsupportedByDeviceError(message)
     if max(exposure_us, period_us) > MAX_EXPOSURE_US:
         message = f"{requested}: the longest is {MAX_EXPOSURE_US} µs ({MAX_EXPOSURE_US / 1e6:g} s); shorten exposure_s"

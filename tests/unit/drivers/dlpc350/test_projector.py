@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from drivers.dlpc350.engine import (
-    MIN_EXPOSURE_US,
     Dlpc350EngineOptions,
     build_tables,
     check_loading,
@@ -228,14 +227,6 @@ def test_a_timing_is_judged_by_rules_with_names(exposure_us: int, period_us: int
         check_timing(Timing(exposure_us, period_us))
 
 
-@pytest.mark.parametrize("bit_depth", MIN_EXPOSURE_US)
-def test_the_shortest_exposure_depends_on_the_bit_depth(bit_depth: int) -> None:
-    least_us = MIN_EXPOSURE_US[bit_depth]
-    check_timing(Timing(least_us, least_us), bit_depth=bit_depth)
-    with pytest.raises(UnsupportedByDeviceError, match=f"{bit_depth}-bit pattern is {least_us} µs"):
-        check_timing(Timing(least_us - 1, least_us + 1000), bit_depth=bit_depth)
-
-
 @pytest.mark.parametrize(
     ("exposure_s", "period_s", "margin_s", "expected"),
     [
@@ -249,21 +240,6 @@ def test_light_covers_the_exposure_and_the_camera_s_start(
     exposure_s: float, period_s: float, margin_s: float, expected: Timing
 ) -> None:
     assert play_timing(exposure_s, period_s, margin_s=margin_s, duty_limit=1.0) == expected
-
-
-@pytest.mark.parametrize(
-    ("timing", "margin_s", "duty_limit", "rule"),
-    [
-        ((0.010, 0.0104), 0.0005, 1.0, "light takes 10500 µs, the period is 10400 µs"),
-        ((0.0, 0.01), 0.0, 1.0, "lengthen the period"),
-        ((0.010, 0.020), 0.0, 0.4, r"light is on for 50% of the time, duty_limit .* 40%"),
-    ],
-)
-def test_light_that_does_not_fit_is_refused(
-    timing: tuple[float, float], margin_s: float, duty_limit: float, rule: str
-) -> None:
-    with pytest.raises(UnsupportedByDeviceError, match=rule):
-        play_timing(*timing, margin_s=margin_s, duty_limit=duty_limit)
 
 
 def test_pictures_beyond_the_buffers_need_time() -> None:

@@ -105,7 +105,9 @@ def test_a_sequence_is_played_once_with_a_pulse_each(bench: Bench) -> None:
         ),
         ("dlpc347x", 0.005, 0.006, {}, "the dark after it 202 µs, the period is 6000 µs; lengthen the period"),
         ("dlpc347x", 0.005, 0.01, {"duty_limit": 0.5}, "duty_limit of the rig file allows 50%"),
-        ("dlpc350", 0.01, 0.02, {"duty_limit": 0.3}, "duty_limit"),
+        ("dlpc350", 0.01, 0.02, {"duty_limit": 0.3}, r"light is on for 5[0-9]% of the time, duty_limit .* 30%"),
+        ("dlpc350", 0.01, 0.0104, {}, "light takes 10500 µs, the period is 10400 µs; lengthen the period"),
+        ("dlpc350", 0.0, 0.02, {}, "requested 0.000000 s of light"),
         ("dlpc350", 150.0, 300.0, {}, "the longest is"),
         # Without dark between, TRIG_OUT_1 has no edge.
         ("dlpc900", 0.01, 0.0105, {}, "the dark after it 105 µs, the period is 10500 µs"),
