@@ -80,15 +80,6 @@ def frame(
     return FilledBuffer(0, 100, corrupt=False, sequence=sequence, stamp=stamp)
 
 
-def test_frames_that_did_not_come_are_lost() -> None:
-    tally = FrameCounter()
-    assert all(tally.is_new(frame(number)) for number in (5, 6, 9, 10))
-    assert (tally.lost, tally.number, tally.period_ns()) == (2, 5, PERIOD_NS)
-    # No buffer was free: nothing is lost.
-    assert tally.is_new(frame(95, queued=93.5))
-    assert (tally.lost, tally.number) == (2, 90)
-
-
 def test_a_repeated_frame_is_refused_and_counted() -> None:
     tally = FrameCounter()
     assert tally.is_new(frame(5))
