@@ -15,7 +15,7 @@ from drivers.dlpc347x import open_projector
 from drivers.dlpc347x.bus import I2cBus, I2cNode, open_bus
 from drivers.dlpc347x.flash import LineEncoder, block_size, build_block, find_lines, locate_patterns
 from drivers.dlpc347x.projector import MIRRORS as CONTROLLERS
-from slrig.devices import StoredPatternProjector, UnknownPolarityProjector
+from slrig.devices import UnknownPolarityProjector
 from slrig.errors import (
     ConfigError,
     DeviceBusyError,
@@ -58,8 +58,6 @@ def test_what_is_set_when_it_is_opened() -> None:
     assert struct.unpack("<3H", bench.engine.registers[0x54]) == (250, 200, 150)
     assert bench.sent(0x92) == ["0000000000", "032c010000"]
     assert projector.info.model == "DLPC3478 light engine, DLP3010, firmware 8.0.1"
-    assert projector.info.gap_s == pytest.approx(0.001 + 202e-6)
-    assert isinstance(projector, StoredPatternProjector)
     assert not isinstance(projector, UnknownPolarityProjector)
     projector.close()
     assert bench.engine.commands[-2:] == [(0x52, b"\0"), (0x9E, b"\1\0")]

@@ -9,7 +9,6 @@ import pytest
 
 from drivers.dlpc900.engine import MAX_PICTURES, encode_picture, pack_sequence
 from drivers.pattern_engine.projector import pattern_plane
-from slrig.devices import StoredPatternProjector
 from slrig.errors import DeviceError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, LineShift, PatternSequence, Size, White
 from slrig.patterns.sequence import encode
@@ -26,12 +25,6 @@ START = STOP = START_STOP
 @pytest.fixture
 def bench() -> Bench:
     return Bench()
-
-
-def test_dark_between_is_declared_and_nothing_is_flashed(bench: Bench) -> None:
-    projector = bench.open()
-    assert projector.info.gap_s == pytest.approx(0.0005 + 105e-6)
-    assert not isinstance(projector, StoredPatternProjector)
 
 
 def test_the_table_comes_before_the_pictures_and_these_last_one_first(bench: Bench) -> None:
@@ -135,12 +128,6 @@ def test_a_piece_of_a_picture_that_went_wrong_is_not_hidden_by_the_next(
     with pytest.raises(UnsupportedByDeviceError, match="take picture 0: a parameter is invalid"):
         projector.load(SEQUENCE)
     assert bench.commands().count(0x1A2B) == 1
-
-
-def test_an_engine_in_standby_gets_no_command_before_it_is_woken() -> None:
-    bench = Bench(standby=True)
-    bench.open().close()
-    assert bench.engine.commands[0] == (0x0200, b"\0")
 
 
 def test_a_picture_is_packed_as_the_guides_example() -> None:
