@@ -97,26 +97,9 @@ def test_a_clock_that_stands_is_not_used(looks: list[tuple[int, int, int]]) -> N
     assert not clock.is_tied
 
 
-def test_a_stamp_somewhere_within_the_exposure_leaves_its_length_open() -> None:
-    host = Host()
-    for lag_ns in (0, EXPOSURE // 2, EXPOSURE):
-        start = tied(host, ANYWHERE).start(host.stamp(100 * MS + lag_ns))
-        assert start.min_ns <= 100 * MS <= start.max_ns
-
-
-@pytest.mark.parametrize("drift", [-5e-5, 5e-5])
-def test_a_drifting_clock_stays_within_what_is_said(drift: float) -> None:
-    host = Host(drift=drift)
-    clock = tied(host)
-    for seconds in (1, 10, 100):
-        start = clock.start(host.stamp(seconds * 1000 * MS))
-        assert start.min_ns <= seconds * 1000 * MS <= start.max_ns
-        assert start.max_ns - start.min_ns <= 2 * DRIFT * seconds * 1e9 + 300_000
-
-
 @pytest.mark.parametrize("latched", [True, False])
-@pytest.mark.parametrize("stamped", [True, False])
-def test_starts_without_triggers_hold_the_truth(latched: bool, stamped: bool) -> None:
+@pytest.mark.parametrize("lag_ns", [None, 0, EXPOSURE // 3, EXPOSURE])
+def test_starts_without_triggers_hold_the_truth(latched: bool, lag_ns: int | None) -> None:
     rng = np.random.default_rng(5)
     host = Host(drift=4e-5)
     clock = StartClock(ANYWHERE)
@@ -126,12 +109,12 @@ def test_starts_without_triggers_hold_the_truth(latched: bool, stamped: bool) ->
     for number in range(500):
         truth_ns = (number + 1) * 33 * MS
         late_ns = int(rng.integers(MS, TRANSFER))
-        stamp_ns = host.stamp(truth_ns + EXPOSURE // 3) if stamped else None
+        stamp_ns = None if lag_ns is None else host.stamp(truth_ns + lag_ns)
         start = starts.start(Arrival(number, stamp_ns, truth_ns + EXPOSURE + late_ns))
         assert start is not None
         assert start.min_ns <= truth_ns <= start.max_ns
         # A latched clock needs no trust in the network.
-        assert start.max_ns - start.min_ns <= (EXPOSURE + 5 * MS if latched and stamped else TRANSFER)
+        assert start.max_ns - start.min_ns <= (EXPOSURE + 5 * MS if latched and lag_ns is not None else TRANSFER)
 
 
 def test_a_frame_that_lay_in_the_camera_is_dated_by_the_clock_and_no_stamp_is_later_than_its_arrival() -> None:

@@ -50,18 +50,6 @@ def jpeg() -> Pixels:
     return np.asarray(data, dtype=np.uint8).reshape(-1)
 
 
-def test_a_jpeg_is_whole_or_refused() -> None:
-    data = jpeg()
-    picture = raw_decoder("MJPG", SIZE, None)
-    padded = np.concatenate([data, np.zeros(40, np.uint8)])
-    for whole in (data.reshape(1, -1), padded):
-        assert np.abs(picture.grey(whole).astype(int) - RAMP).max() <= 2
-    with pytest.raises(CorruptFrameError, match="JPEG"):
-        picture.grey(data[: len(data) // 2])
-    with pytest.raises(CorruptFrameError, match="16 x 8, expected 16 x 16"):
-        raw_decoder("MJPG", Size(16, 16), None).grey(data)
-
-
 @pytest.mark.parametrize(
     ("picture", "image", "words"),
     [
