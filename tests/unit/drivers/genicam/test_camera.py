@@ -6,6 +6,10 @@ import importlib
 import re
 import signal
 import struct
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +21,7 @@ from drivers.genicam import (
     GenicamOptions,
     find_devices,
     find_gentl_devices,
+    link,
     open_camera,
     open_gentl_camera,
 )
@@ -34,14 +39,67 @@ from slrig.errors import (
 from slrig.model import Frame, Pixels, Size
 from tests.contract import genicam_bench, gentl_bench
 from tests.contract.genicam_bench import CAMERA, FakeGigE, Fate, Relay, require_aravis, scene
+from tests.contract.genicam_peer import PIXEL_FORMATS
 from tests.contract.gentl_producer import OVERHEAD_S, REGISTERS, MemoryCamera
 from tests.contract.stage import Stage
-from tests.unit.drivers.genicam.conftest import EXPOSURE_S, Device
+from tests.unit.drivers.genicam.test_pixels import encoded
 
 LONG_S, SHORT_S = 5.0, 0.05
 WHITE = np.full((1, 1), 255, np.uint8)
 PATIENT: dict[str, object] = {"answer_s": 2.0, "transfer_s": 2.0}
 """How late a frame may come, on a machine that does much else."""
+
+EXPOSURE_S = 0.005
+NO_LATCH = ("TimestampLatch", "TimestampLatchValue")
+
+
+@dataclass
+class Device:
+    """A camera before a dark stage, and the driver that opens it."""
+
+    camera: FakeGigE | MemoryCamera
+    opened: Callable[..., GenicamCamera]
+    unplug: Callable[[], object]
+    plug: Callable[[], object]
+    closing: ExitStack = field(default_factory=ExitStack)
+
+    def open(self, **options: object) -> GenicamCamera:
+        """The driver's camera, set to 5 ms; closed after the test."""
+        camera = self.opened(**options)
+        self.closing.callback(camera.close)
+        camera.configure(CameraSettings(EXPOSURE_S))
+        return camera
+
+
+@pytest.fixture(scope="module")
+def gige() -> Iterator[FakeGigE]:
+    """One for a whole file. Skips where Aravis is not installed."""
+    require_aravis()
+    packed = {name: partial(encoded, name=name) for name in PIXEL_FORMATS}
+    with FakeGigE(Stage(scene()), kind="sfnc", packed=packed) as peer:
+        yield peer
+
+
+@pytest.fixture(params=["genicam", "gentl"])
+def device(request: pytest.FixtureRequest) -> Iterator[Device]:
+    """A camera of each kind; "gentl, no latch" has a clock that cannot be looked at."""
+    with ExitStack() as leaving:
+        if request.param == "genicam":
+            peer: FakeGigE = request.getfixturevalue("gige")
+            peer.stage, peer.fate = Stage(scene()), Fate
+            peer.exposures.clear()
+            peer.start()
+            found = Device(peer, genicam_bench.opened, peer.stop, peer.start)
+        else:
+            memory = MemoryCamera(Stage(scene()), without=NO_LATCH if "no latch" in request.param else ())
+            producer = leaving.enter_context(gentl_bench.serving(memory))
+            plugged = partial(setattr, memory, "plugged")
+            found = Device(
+                memory, partial(gentl_bench.opened, producer), partial(plugged, False), partial(plugged, True)
+            )
+        leaving.enter_context(found.closing)
+        yield found
+
 
 GENICAM = pytest.mark.parametrize("device", ["genicam"], indirect=True)
 
@@ -406,6 +464,47 @@ def test_no_wait_of_gentl_keeps_other_threads_waiting() -> None:
         camera.read(0, LONG_S)
         camera.close()
         assert producer.longest_wait_ms == 0
+
+
+# ---- what limits frames on their way
+
+
+@pytest.mark.parametrize(("memory_mb", "notes"), [("0", 0), ("10", 0), ("9", 1)])
+def test_little_memory_for_usb_is_noted_with_the_command_that_gives_more(
+    memory_mb: str, notes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usbfs = tmp_path / "usbfs_memory_mb"
+    usbfs.write_text(f"{memory_mb}\n")
+    monkeypatch.setattr(link, "USBFS", usbfs)
+    # 32 frames of 640 x 480 bytes.
+    with gentl_bench.serving(MemoryCamera(Stage(scene()), link="U3V")) as producer:
+        camera = gentl_bench.opened(producer, region=None)
+        camera.arm(1, Trigger.HARDWARE)
+        with pytest.raises(FrameTimeoutError, match="check the trigger's cable") as late:
+            camera.read(0, 0.0)
+        camera.close()
+    told = camera.info.notes
+    assert len(told) == notes
+    assert all("9 MB of the system" in note and f"sudo sh -c 'echo 1000 > {usbfs}'" in note for note in told)
+    assert all(note in str(late.value) for note in told)
+
+
+@pytest.mark.parametrize(("subclass", "permitted", "found"), [("05", False, 1), ("05", True, 0), ("02", False, 0)])
+def test_a_usb3_vision_camera_that_the_user_may_not_open_is_listed_with_its_udev_rule(
+    subclass: str, permitted: bool, found: int, tmp_path: Path
+) -> None:
+    told = {"idVendor": "2676", "manufacturer": "Basler", "product": "acA1300", "serial": "23A", "busnum": "2"}
+    facts = {"1-2": {**told, "devnum": "7"}, "1-2:1.0": {"bInterfaceClass": "ef", "bInterfaceSubClass": subclass}}
+    for device, each in facts.items():
+        (tmp_path / "sys" / device).mkdir(parents=True)
+        for name, text in each.items():
+            (tmp_path / "sys" / device / name).write_text(f"{text}\n")
+    if permitted:
+        (tmp_path / "dev/002").mkdir(parents=True)
+        (tmp_path / "dev/002/007").touch()
+    devices = link.find_forbidden(tmp_path / "sys", tmp_path / "dev")
+    assert [(each.driver, each.device) for each in devices] == [("genicam", "23A")] * found
+    assert all('ATTR{idVendor}=="2676"' in each.label and "Basler acA1300 23A" in each.label for each in devices)
 
 
 # ---- what goes wrong
