@@ -15,13 +15,7 @@ import pytest
 from drivers.opencv import open_camera as open_opencv_camera
 from slrig.devices import Camera, CameraSettings, Rig, ScannerHead
 from slrig.model import PatternSequence, Pixels, Size
-from tests.contract import (
-    depthai_bench,
-    genicam_bench,
-    gentl_bench,
-    opencv_bench,
-    v4l2_bench,
-)
+from tests.contract import depthai_bench, genicam_bench, gentl_bench, opencv_bench, v4l2_bench
 from tests.contract.genicam_bench import Fate, Relay
 from tests.contract.genicam_peer import INTERFACE
 from tests.contract.gentl_producer import MemoryCamera

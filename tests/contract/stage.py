@@ -45,13 +45,7 @@ class Stage:
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        *,
-        latency_s: float = 0.0,
-        jitter_s: float = 0.0,
-        seed: int = 0,
-        clock: Clock | None = None,
+        self, scene: Scene, *, latency_s: float = 0.0, jitter_s: float = 0.0, seed: int = 0, clock: Clock | None = None
     ) -> None:
         self.clock = clock or SystemClock()
         self.scene = scene

@@ -222,11 +222,7 @@ def test_depthai_reports_nothing_to_its_maker_unless_the_user_asks_for_it(monkey
     ids=[each[0] for each in MISSING if each[0] != "gi.repository.Aravis"],
 )
 def test_a_library_that_was_built_for_others_is_named_with_the_command_that_builds_it_anew(
-    module: str,
-    calls: tuple[Callable[[], object], ...],
-    install: str,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
+    module: str, calls: tuple[Callable[[], object], ...], install: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     for loaded in LOADED:
         loaded.cache_clear()

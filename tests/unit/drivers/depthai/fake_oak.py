@@ -246,13 +246,7 @@ class FakeSensor(Node):  # type: ignore[misc]
         return self
 
     def requestOutput(  # noqa: N802
-        self,
-        size: tuple[int, int],
-        kind: Any,
-        *,
-        resizeMode: Any,
-        fps: float,
-        enableUndistortion: bool,
+        self, size: tuple[int, int], kind: Any, *, resizeMode: Any, fps: float, enableUndistortion: bool
     ) -> Any:
         assert resizeMode == dai.ImgResizeMode.CROP
         assert fps == self._fps

@@ -168,10 +168,7 @@ def test_a_flash_that_has_no_room_or_forgets_is_reported(worn: bool) -> None:
     ],
 )
 def test_what_the_engine_does_not_take_or_gives_back_otherwise_is_reported_and_it_is_dark(
-    engine: dict[str, Any],
-    bent: dict[int, bytes],
-    error: type[DeviceError],
-    told: str,
+    engine: dict[str, Any], bent: dict[int, bytes], error: type[DeviceError], told: str
 ) -> None:
     bench = Bench(**engine)
     bench.engine.bent = bent

@@ -10,13 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.dlpc350.engine import (
-    Dlpc350EngineOptions,
-    build_tables,
-    check_loading,
-    check_timing,
-    play_timing,
-)
+from drivers.dlpc350.engine import Dlpc350EngineOptions, build_tables, check_loading, check_timing, play_timing
 from drivers.dlpc350.flash import (
     EXPORT_FOLDER,
     LIST_FILE,
@@ -31,13 +25,7 @@ from drivers.dlpc350.flash import (
 from drivers.pattern_engine.options import LedColour
 from drivers.pattern_engine.projector import Timing, pattern_plane
 from slrig.bundle.validation import validate
-from slrig.errors import (
-    ConfigError,
-    DeviceError,
-    DeviceStateError,
-    StorageError,
-    UnsupportedByDeviceError,
-)
+from slrig.errors import ConfigError, DeviceError, DeviceStateError, StorageError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, LineShift, Pattern, PatternSequence, Primary, White
 from slrig.patterns.sequence import encode, scan_patterns
 from tests.unit.drivers.pattern_engine.engine_bench import LEDS, START_STOP, flash_350
@@ -295,13 +283,7 @@ def test_the_led_current_is_limited() -> None:
 
 def scan(*, rows: bool = False, period_px: int = 8) -> PatternSequence:
     patterns = scan_patterns(
-        MIRRORS,
-        line_shift=True,
-        period_px=period_px,
-        line_width_px=1,
-        gray_cell_px=None,
-        gray_offset_px=0,
-        rows=rows,
+        MIRRORS, line_shift=True, period_px=period_px, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=rows
     )
     return encode(patterns, MIRRORS)
 

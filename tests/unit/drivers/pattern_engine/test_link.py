@@ -230,10 +230,7 @@ def test_none_is_no_error_for_the_finder_and_one_for_a_rig(tmp_path: Path) -> No
 
 @pytest.mark.parametrize(
     ("driver", "hid", "engine", "options"),
-    [
-        (dlpc350, ENGINE, FakeEngine({}), {"patterns": "p"}),
-        (dlpc900, "0003:00000451:0000C900", Fake900(), {}),
-    ],
+    [(dlpc350, ENGINE, FakeEngine({}), {"patterns": "p"}), (dlpc900, "0003:00000451:0000C900", Fake900(), {})],
 )
 def test_a_rig_opens_the_engine_that_it_means(
     driver: Any,

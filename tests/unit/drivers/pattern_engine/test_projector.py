@@ -100,13 +100,7 @@ def test_a_sequence_is_played_once_with_a_pulse_each(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("made", "exposure_s", "period_s", "options", "rule"),
     [
-        (
-            "dlpc347x",
-            0.01,
-            0.02,
-            {},
-            "requested 11000 µs of blue light, .* cameras by software",
-        ),
+        ("dlpc347x", 0.01, 0.02, {}, "requested 11000 µs of blue light, .* cameras by software"),
         ("dlpc347x", 0.005, 0.006, {}, "the dark after it 202 µs, the period is 6000 µs; lengthen the period"),
         ("dlpc347x", 0.005, 0.01, {"duty_limit": 0.5}, "duty_limit of the rig file allows 50%"),
         ("dlpc350", 0.01, 0.02, {"duty_limit": 0.3}, r"light is on for 5[0-9]% of the time, duty_limit .* 30%"),

@@ -17,12 +17,7 @@ from drivers.picamera2 import PiCamera, find_devices, open_camera
 from drivers.picamera2 import camera as camera_module
 from slrig.capture.sequencer import capture
 from slrig.devices import CameraSettings, Rig, Trigger
-from slrig.errors import (
-    DeviceBusyError,
-    DeviceGoneError,
-    FrameTimeoutError,
-    UnsupportedByDeviceError,
-)
+from slrig.errors import DeviceBusyError, DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Frame, Size
 from tests.contract.picamera2_bench import connect, global_shutter
 from tests.contract.stage import Stage

@@ -14,13 +14,7 @@ import pytest
 from drivers.screen import find_devices, open_projector, x11
 from drivers.screen.x11 import XConnection
 from slrig.devices import FoundDevice, Projector
-from slrig.errors import (
-    DeviceBusyError,
-    DeviceError,
-    DeviceGoneError,
-    DeviceStateError,
-    UnsupportedByDeviceError,
-)
+from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Size
 from tests.contract.screen_bench import let_go, rig_options, sequence
 from tests.contract.screen_server import DummyServer, OutputPixels

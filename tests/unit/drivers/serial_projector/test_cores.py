@@ -112,9 +112,7 @@ def random_lines(seed: int, count: int) -> list[tuple[int, bytes]]:
 
 
 @pytest.mark.parametrize("make_box", [remote.micropython, remote.arduino])
-def test_every_core_plays_the_same_sessions(
-    make_box: Callable[[BoxHardware, BoxDescription, int], RemoteBox],
-) -> None:
+def test_every_core_plays_the_same_sessions(make_box: Callable[[BoxHardware, BoxDescription, int], RemoteBox]) -> None:
     said = ""
     for seed in range(4):
         lines = random_lines(seed, 600)

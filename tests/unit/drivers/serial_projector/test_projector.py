@@ -20,13 +20,7 @@ from drivers.serial_projector.device import protocol
 from drivers.serial_projector.link import BoxLink, SequenceMode
 from drivers.serial_projector.projector import SerialProjector
 from slrig.devices import StoredPatternProjector
-from slrig.errors import (
-    DeviceBusyError,
-    DeviceError,
-    DeviceGoneError,
-    DeviceStateError,
-    UnsupportedByDeviceError,
-)
+from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 from tests.unit.drivers.serial_projector.conftest import CRC32, SEQUENCE, SIZE, Bench, whole_sequence
 from tests.unit.drivers.serial_projector.engines import (
