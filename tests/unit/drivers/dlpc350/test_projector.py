@@ -27,7 +27,8 @@ from drivers.pattern_engine.projector import Timing, pattern_plane
 from slrig.bundle.validation import validate
 from slrig.errors import ConfigError, DeviceError, DeviceStateError, StorageError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, LineShift, Pattern, PatternSequence, Primary, White
-from slrig.patterns.sequence import encode, scan_patterns
+from slrig.patterns.sequence import encode
+from tests.contract.suite import whole_scan
 from tests.unit.drivers.pattern_engine.engine_bench import LEDS, START_STOP, flash_350
 from tests.unit.drivers.pattern_engine.engine_bench import SEQUENCE_350 as SEQUENCE
 from tests.unit.drivers.pattern_engine.engine_bench import Bench350 as Bench
@@ -281,11 +282,8 @@ def test_the_led_current_is_limited() -> None:
     assert Dlpc350EngineOptions(patterns="p", led_current=0.6, led_current_limit=0.6).colour is LedColour.WHITE
 
 
-def scan(*, rows: bool = False, period_px: int = 8) -> PatternSequence:
-    patterns = scan_patterns(
-        MIRRORS, line_shift=True, period_px=period_px, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=rows
-    )
-    return encode(patterns, MIRRORS)
+def scan(*, rows: bool = False) -> PatternSequence:
+    return whole_scan(MIRRORS, period_px=8, line_width_px=1, rows=rows)
 
 
 def few(*patterns: Pattern) -> PatternSequence:

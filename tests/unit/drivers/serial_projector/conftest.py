@@ -10,8 +10,8 @@ import pytest
 
 from drivers.serial_projector.client import SerialProjectorOptions, pattern_checksums
 from drivers.serial_projector.projector import SerialProjector
-from slrig.model import PatternSequence, Size
-from slrig.patterns.sequence import encode, scan_patterns
+from slrig.model import Size
+from tests.contract.suite import whole_scan
 from tests.unit.drivers.serial_projector.engines import CoreEngine, Scene, description
 from tests.unit.drivers.serial_projector.line import MemoryLine
 from tests.virtual_clock import VirtualClock
@@ -19,14 +19,7 @@ from tests.virtual_clock import VirtualClock
 SIZE = Size(400, 300)
 
 
-def whole_sequence(size: Size = SIZE, *, line_width_px: int = 1) -> PatternSequence:
-    patterns = scan_patterns(
-        size, line_shift=True, period_px=8, line_width_px=line_width_px, gray_cell_px=None, gray_offset_px=0, rows=False
-    )
-    return encode(patterns, size)
-
-
-SEQUENCE = whole_sequence()
+SEQUENCE = whole_scan(SIZE, period_px=8, line_width_px=1)
 CRC32 = pattern_checksums(SEQUENCE)
 
 

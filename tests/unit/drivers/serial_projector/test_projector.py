@@ -22,7 +22,8 @@ from drivers.serial_projector.projector import SerialProjector
 from slrig.devices import StoredPatternProjector
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
-from tests.unit.drivers.serial_projector.conftest import CRC32, SEQUENCE, SIZE, Bench, whole_sequence
+from tests.contract.suite import whole_scan
+from tests.unit.drivers.serial_projector.conftest import CRC32, SEQUENCE, SIZE, Bench
 from tests.unit.drivers.serial_projector.engines import (
     GAP_US,
     HOLD_US,
@@ -146,7 +147,7 @@ def test_patterns_that_are_not_flashed_are_refused_dark_and_nothing_is_written(b
     projector = bench.open(tmp_path)
     projector.load(SEQUENCE)
     projector.show(0)
-    wider = whole_sequence(SIZE, line_width_px=2)
+    wider = whole_scan(SIZE, period_px=8)
     with pytest.raises(UnsupportedByDeviceError, match=r"it lacks 8 of them, pattern 12 first\..*slrig patterns"):
         projector.load(wider)
     assert bench.lit is None
@@ -171,7 +172,7 @@ def test_each_set_of_patterns_is_written_into_a_folder_of_its_own(bench: Bench, 
         assert image is not None
         assert np.array_equal(image, BACKWARDS.image(index))
     with pytest.raises(UnsupportedByDeviceError, match="shows 400 x 300"):
-        projector.write_patterns(whole_sequence(Size(408, 300)))
+        projector.write_patterns(whole_scan(Size(408, 300)))
 
 
 @pytest.mark.parametrize(
