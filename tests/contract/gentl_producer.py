@@ -371,42 +371,21 @@ OVERHEAD_S = 0.001
 """From the end of an exposure to the next one's start, at least."""
 
 PIXEL_FORMATS = {"Mono8": 0x01080001, "Mono12": 0x01100005}
+_NAMES = {
+    "I": "Width Height PixelFormat PayloadSize AcquisitionMode AcquisitionStart AcquisitionStop TLParamsLocked "
+    "TriggerSelector TriggerMode TriggerSource TriggerSoftware ExposureAuto TimestampLatch ReverseX "
+    "TriggerActivation TriggerOverlap GammaEnable LUTEnable LineSelector UserSetSelector UserSetLoad "
+    "BinningHorizontal DeviceLinkThroughputLimit GevSCPSPacketSize",
+    "d": "ExposureTime Gain ResultingFrameRate TriggerDelay SharpnessEnhancement NoiseReduction BlackLevel "
+    "LineDebouncerTime",
+    "q": "TimestampLatchValue",
+    "16s": "DeviceUserID",
+}
+"""Registers by the code of their content."""
+
 REGISTERS = {
-    "Width": (0x100, "I"),
-    "Height": (0x104, "I"),
-    "PixelFormat": (0x108, "I"),
-    "PayloadSize": (0x10C, "I"),
-    "AcquisitionMode": (0x110, "I"),
-    "AcquisitionStart": (0x114, "I"),
-    "AcquisitionStop": (0x118, "I"),
-    "TLParamsLocked": (0x11C, "I"),
-    "TriggerSelector": (0x120, "I"),
-    "TriggerMode": (0x124, "I"),
-    "TriggerSource": (0x128, "I"),
-    "TriggerSoftware": (0x12C, "I"),
-    "ExposureAuto": (0x130, "I"),
-    "TimestampLatch": (0x134, "I"),
-    "TimestampLatchValue": (0x140, "q"),
-    "ExposureTime": (0x148, "d"),
-    "Gain": (0x150, "d"),
-    "ResultingFrameRate": (0x158, "d"),
-    "ReverseX": (0x160, "I"),
-    "TriggerActivation": (0x164, "I"),
-    "TriggerOverlap": (0x168, "I"),
-    "GammaEnable": (0x16C, "I"),
-    "LUTEnable": (0x170, "I"),
-    "LineSelector": (0x174, "I"),
-    "UserSetSelector": (0x178, "I"),
-    "UserSetLoad": (0x17C, "I"),
-    "DeviceUserID": (0x180, "16s"),
-    "TriggerDelay": (0x190, "d"),
-    "SharpnessEnhancement": (0x198, "d"),
-    "NoiseReduction": (0x1A0, "d"),
-    "BlackLevel": (0x1A8, "d"),
-    "LineDebouncerTime": (0x1B0, "d"),
-    "BinningHorizontal": (0x1B8, "I"),
-    "DeviceLinkThroughputLimit": (0x1BC, "I"),
-    "GevSCPSPacketSize": (0x1C0, "I"),
+    name: (0x100 + 0x10 * place, code)
+    for place, (code, name) in enumerate((code, name) for code, names in _NAMES.items() for name in names.split())
 }
 _BY_ADDRESS = {address: (name, code) for name, (address, code) in REGISTERS.items()}
 _ENUMERATIONS = {
