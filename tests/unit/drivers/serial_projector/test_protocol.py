@@ -20,7 +20,7 @@ import pytest
 import drivers.serial_projector
 from drivers.serial_projector.client import BoxInfo, BoxStatus, sequence_checksum
 from drivers.serial_projector.device import wire
-from drivers.serial_projector.device.box import BoxDescription, BoxHardware, HardwareError, LightTime
+from drivers.serial_projector.device.box import BoxDescription, BoxHardware, HardwareError
 from drivers.serial_projector.device.protocol import TriggerBox
 from drivers.serial_projector.link import (
     BoxAnswer,
@@ -342,21 +342,6 @@ def test_light_is_rationed_by_duty() -> None:
     assert host.refused("SEQ 0 26 5000 10000 0") == RefusalCode.LIMIT, "more light than duty in the long run"
     host.pass_us(10_000_001)
     host.ok("SEQ 0 26 5000 20000 0")
-
-
-def test_light_time_counts_the_last_ten_seconds() -> None:
-    counted = LightTime()
-    now_us, history = 0, []
-    for step in range(1_000):
-        lit = step % 7 < 3
-        now_us += 37_003
-        counted.note(now_us, lit)
-        history.append((now_us, lit))
-        truth = sum(37_003 for at, on in history if on and at > now_us - 10_000_000)
-        # Slots are forgotten whole.
-        assert truth - 550_000 <= sum(counted.slots) <= truth + 550_000
-    counted.note(now_us + 10**9, False)
-    assert sum(counted.slots) == 0
 
 
 @pytest.mark.parametrize(
