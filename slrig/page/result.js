@@ -31,11 +31,14 @@ export function ResultScreen({id, rig, may}) {
 
 const Back = () => html`<p><a href="#/scan/all">All scans</a> · <a href="#/scan">Live picture</a></p>`;
 
-function Result({scan, rig, again, may}) {
-  const {files} = scan.links;
-  const over = OVER.includes(scan.state);
-  const [told, setTold] = useState(scan.progress);
+function Result({scan: asked, rig, again, may}) {
+  const {files} = asked.links;
+  const over = OVER.includes(asked.state);
+  const [told, setTold] = useState(asked.progress);
   const [report, refused] = useValue(files["report.json"] ?? null);
+  // While a scan is computed again, and where that failed, its files are those of before.
+  const own = report?.self_calibration;
+  const scan = own ? {...asked, unit: own.unit === "mm" ? "mm" : "% of baseline"} : asked;
   const [calibration] = useValue(files["calibration.json"] ?? null);
   const [other, setOther] = useState(null);
   const [pointed, point] = useState(null);
@@ -45,19 +48,19 @@ function Result({scan, rig, again, may}) {
   }, again), [over]);
   const hasMesh = MESH in files;
   const progress = !over && html`<div class="box">
-    ${hasMesh && html`<p role="status">The mesh is ready. The other files are being computed.</p>`}
+    ${hasMesh && html`<p role="status">${report ? "It is being computed again; this is the result of before." : "The mesh is ready. The other files are being computed."}</p>`}
     <${Progress} label=${told.stage} fraction=${told.fraction} detail=${told.detail} /></div>`;
   const head = html`<div class="head"><${Back} />
       <${NameHeading} job=${scan} kind="Scan" may=${may("scan")} again=${again}><${JobBadge} state=${scan.state} /><//>
-      ${Object.keys(files).length > 0 && html`<${Downloads} files=${files} />`}</div><${Refusal} problem=${refused} />`;
-  const panels = html`${hasMesh && report?.self_calibration && html`<${Panel} name="Calibration by this scan"><${FoundCalibration} scan=${scan} report=${report} rig=${rig} may=${may} changed=${again} /><//>`}
+      ${Object.keys(files).length > 0 && html`<${Downloads} files=${files} />`}</div><${Refusal} problem=${refused} />
+      ${over && hasMesh && scan.error && html`<${Refusal} problem=${{document: scan.error, message: scan.error.detail}}><p>What is shown was made before.</p><//>`}`;
+  const panels = html`${hasMesh && own && html`<${Panel} name="Calibration by this scan"><${FoundCalibration} scan=${scan} report=${report} rig=${rig} may=${may} over=${over} changed=${again} /><//>`}
     ${hasMesh && html`<${Panel} name="Figures"><${Figures} scan=${scan} report=${report} /><//>`}
     ${report && Object.entries(report.cameras).map(([name, camera]) => html`<${Panel} key=${name} name=${`Camera ${name}`}>
       <${Causes} camera=${name} told=${camera} causes=${report.causes} files=${files} device=${calibration?.cameras[name] ?? null} pointed=${pointed} point=${point} /><//>`)}
     ${over && hasMesh && html`<${Panel} name="Compare"><${Compare} scan=${scan} chosen=${setOther} /><//>`}
     <${Panel} name="Keep or delete">${may("scan") && html`<${Keeping} job=${scan} kind="scan" over=${over} again=${again} />`}<//>`;
-  const guess = may("scan") && over && files["bundle.zip"] && scan.plan?.reconstruction.uncalibrated;
-  const rescale = guess ? (scale) => computeAgain(scan, rescaled(guess, scale)).then(again) : null;
+  const rescale = own && may("scan") && over && files["bundle.zip"] ? (scale) => computeAgain(scan, rescaled(report.plan.uncalibrated, scale)).then(again) : null;
   if (hasMesh)
     return html`<${Mesh} key=${scan.id} scan=${scan} other=${other} report=${report} calibration=${calibration} again=${may("scan") ? limitToBox : null} over=${progress}
       pointed=${pointed} point=${point} rescale=${rescale} head=${head}>${panels}<//>`;

@@ -1,7 +1,7 @@
 // Scans of a rig without a calibration: what is known of its devices, what the scan found, and how it becomes the rig's calibration.
 import {html, useState} from "./vendor/preact-htm.js";
 import {ask, useAction} from "./service.js";
-import {Action, Choice, Facts, Field, Refusal, count, number, percent} from "./ui.js";
+import {Action, Choice, Facts, Field, Refusal, count, length, number, percent} from "./ui.js";
 
 const KEPT = "guess";
 /** How long one is where its length is not known: lengths are in hundredths of it. */
@@ -109,11 +109,12 @@ export function OtherGuesses({scan, rig, changed}) {
 }
 
 /** The calibration that a scan found: its error, its unit, and how to make it that of the rig. */
-export function FoundCalibration({scan, report, rig, may, changed}) {
+export function FoundCalibration({scan, report, rig, may, over, changed}) {
   const {shape_error: error, shape_error_mm: errorLength, size_mm: size, unit, scale_sigma: scale, focal_changed: focal, pairs} = report.self_calibration;
+  const guess = report.plan.uncalibrated;
   const inMm = unit === "mm";
   const [baseline, setBaseline] = useState("");
-  const [compute, busy, refused] = useAction(() => computeAgain(scan, {...scan.plan.reconstruction.uncalibrated, baseline_mm: Number(baseline)}).then(changed));
+  const [compute, busy, refused] = useAction(() => computeAgain(scan, {...guess, baseline_mm: Number(baseline)}).then(changed));
   const [use, using, unused] = useAction(async () => {
     const file = JSON.stringify(await ask("GET", scan.links.files["calibration.json"]));
     const label = `Found by scan${scan.label ? ` ${scan.label}` : ""}`.slice(0, 100);
@@ -129,18 +130,18 @@ export function FoundCalibration({scan, report, rig, may, changed}) {
   return html`<p>This scan calibrated the rig by itself, without a board.</p>
     <${Facts} of=${[
       ["Error of its shape (1 σ)", `${percent(error)} of its size: ${number(errorLength, {digits: 2})} of ${number(size)} ${lengths}`],
-      ["Unit of all lengths", inMm ? "mm, by the distance that was stated" : "hundredths of the distance from the first camera to the projector"],
+      ["Unit of all lengths", inMm ? `mm: the baseline is ${length(guess.baseline_mm)}` : "hundredths of the distance from the first camera to the projector"],
       ["The size may be wrong by (1 σ)", inMm ? percent(scale) : null],
       ...Object.entries(focal).map(([name, change]) => [`Focal length of ${name}`, `${change < 0 ? "−" : "+"}${percent(Math.abs(change))} from the guess`]),
       ["Pixels compared", count(pairs)],
     ]} />
-    ${!inMm && html`<form onSubmit=${submit}><p class="warning">These lengths are no millimetres. Measure something whose length you know (Measure, Distance) and say how long it is; or say how far the first
+    ${!inMm && over && html`<form onSubmit=${submit}><p class="warning">These lengths are no millimetres. Measure something whose length you know (Measure, Distance) and say how long it is; or say how far the first
       camera is from the projector, lens to lens.</p>
       <div class="row numbers"><${Field} label="First camera to projector, mm" value=${baseline} change=${setBaseline} required />
         <button class="action" type="submit" aria-busy=${busy} disabled=${busy || !may("scan")}>Compute again in mm</button></div></form>`}
     <${Refusal} problem=${refused} />
     ${used ? html`<p role="status">The rig uses this calibration. <a href="#/scan">Scan</a> with it, or <a href=${rig.calibration.id ? `#/calibrate/${rig.calibration.id}` : "#/calibrate"}>look at it</a>.</p>`
-      : inMm && html`<div class="row"><${Action} kind="primary" busy=${using} disabled=${!may("calibrate")} onClick=${use}>Use it as the rig's calibration<//>
+      : inMm && over && html`<div class="row"><${Action} kind="primary" busy=${using} disabled=${!may("calibrate")} onClick=${use}>Use it as the rig's calibration<//>
         <span class="quiet">${may("calibrate") ? "Scans use it from the next one on, and state its error." : "This takes a key with the scope “calibrate”."}</span></div>`}
     <${Refusal} problem=${unused} />`;
 }

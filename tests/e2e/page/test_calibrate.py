@@ -71,7 +71,8 @@ def scan_without_a_calibration(page: Page) -> None:
     page.get_by_label("True length, mm").fill("110")
     assert violations(page) == []
     page.get_by_role("button", name="Compute again with this length").click()
-    page.get_by_text("mm, by the distance that was stated").wait_for(timeout=_SOLVED_MS)
+    page.get_by_text("It is being computed again; this is the result of before.").wait_for()
+    page.get_by_text("mm: the baseline is").wait_for(timeout=_SOLVED_MS)
     page.get_by_text(re.compile(r"^[\d\s]+ triangles\.$")).wait_for()
     looks_as_kept(page, "result-uncalibrated")
     page.get_by_role("button", name="Use it as the rig's calibration").click()
