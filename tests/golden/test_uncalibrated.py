@@ -54,7 +54,7 @@ blur_px = 0.6
 BASELINE_MM = float(np.linalg.norm([70.0, -8.0, -15.0]))
 
 
-def guess(**others: float) -> RigGuess:
+def guess(**others: Any) -> RigGuess:
     """The throw ratio 3 % wrong. The camera's focal length is what its pictures state."""
     return RigGuess(throw_ratio=700 / 512 * 0.97, throw_sigma=0.03, **others)
 

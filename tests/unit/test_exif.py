@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -54,7 +55,7 @@ def picture(path: Path, pixels: Pixels | None = None, **tags: object) -> Path:
     ],
 )  # fmt: skip
 def test_a_picture_states_the_focal_length_of_its_camera(
-    tmp_path: Path, ending: str, tags: dict[str, object], focal_px: float | None
+    tmp_path: Path, ending: str, tags: dict[str, Any], focal_px: float | None
 ) -> None:
     found = read_focal_px(picture(tmp_path / f"a.{ending}", **tags), SIZE)
     assert found == (focal_px if focal_px is None else pytest.approx(focal_px, rel=1e-4))
