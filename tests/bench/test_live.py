@@ -148,7 +148,7 @@ def test_how_soon_the_page_shows_what_came(start: Start, tmp_path: Path, visit: 
         (ended_s, _), took_s, last = spent(process), time.monotonic() - begun, client.live.status()["facts"]["number"]
     least, middle, most = np.quantile(delays_s, [0.05, 0.5, 0.95]) * 1e3
     print(  # noqa: T201
-        f"\nbeside an open page: {(last - first) / took_s:.1f} images a second, {(ended_s - begun_s) / took_s:.2f} cores"
+        f"\nnext to an open page: {(last - first) / took_s:.1f} images/s, {(ended_s - begun_s) / took_s:.2f} cores"
         f"; the page shows {len(delays_s) / took_s:.1f} a second, {middle:.0f} ms after the newest frame of each came "
         f"(5 and 95 %: {least:.0f} and {most:.0f})"
     )
