@@ -24,8 +24,8 @@ export function ResultScreen({id, rig, may}) {
   if (problem?.status === 404 || problem?.status === 422)
     return html`<${Back} /><${Refusal} problem=${{document: {title: "Scan not found"}, message: "It was deleted, or the address is not right."}} />`;
   if (!scan) return html`<${Back} /><${Refusal} problem=${problem} />${!problem && html`<p class="wait">Asking for the scan …</p>`}`;
-  if (scan.finished_at && made.current.at(-1) !== scan.finished_at) made.current.push(scan.finished_at);
-  // What was computed again is fetched again.
+  // What was computed again is fetched again, where there was a mesh before.
+  if (scan.finished_at && MESH in scan.links.files && made.current.at(-1) !== scan.finished_at) made.current.push(scan.finished_at);
   return html`<${Result} key=${Math.max(made.current.length, 1)} scan=${scan} rig=${rig} again=${again} may=${may} />`;
 }
 
