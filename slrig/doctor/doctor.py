@@ -213,10 +213,13 @@ class _DoctorRun:
             ("timing", self._measure_timing),
             ("picture and focus", self._check_pictures),
             ("response", self._measure_response),
-            ("flicker", self._measure_flicker),
+            # A lens that goes to and fro may be back where it was at one look.
             ("steadiness", self._check_steady),
+            ("flicker", self._measure_flicker),
             ("exposure", self._advise_exposures),
+            ("steadiness", self._check_steady),
             ("live depth", self._measure_live),
+            ("steadiness", self._check_steady),
         ]
         if self.rig.projector.info.plays and all(
             Trigger.HARDWARE in camera.info.triggers for camera in self.rig.cameras.values()
@@ -350,7 +353,11 @@ class _DoctorRun:
 
     def _check_steady(self) -> None:
         for name, picture in self._pictures.items():
-            self.findings += check_steady(self._open_session(name), self.sequence, self.lights[name], picture)
+            label = camera_label(name)
+            before = [each for each in self.findings if (each.name, each.subject) == ("picture.steady", label)]
+            if all(each.severity is Severity.OK for each in before):
+                found = check_steady(self._open_session(name), self.sequence, self.lights[name], picture)
+                self.findings = [each for each in self.findings if each not in before] + found
 
     def _best_lit(self) -> LightMeasurement | None:
         """Measurement by the camera whose image the projector lights most: it examines the projector."""

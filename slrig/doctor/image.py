@@ -47,6 +47,7 @@ _CAMERA_SHARE, _PROJECTOR_SHARE = 0.6, 0.35
 _BORDER_PX = 12
 _RESOLVED = 0.3  # square wave of bars over white less black
 _MAX_CHANGE = 0.15  # of bars that are shown again, over their contrast
+_ELSEWHERE = 0.7  # of that change, what another contrast leaves; bars that moved leave more
 
 _MIN_CERTAIN = 0.5  # share of the pixels by which a bit can be read
 _MAX_PAIRS = 20_000
@@ -152,28 +153,45 @@ def check_steady(
     """Show the finest bars that the camera resolves once more: a lens that moves shows, whatever its driver answers."""
     levels, usable = light.levels, light.levels.usable
     noise = 4 * levels.noise_dn**2
-    powers = [float(np.mean(each.difference[usable] ** 2)) for each in picture.bars]
-    white = float(np.mean(levels.contrast[usable] ** 2))
-    resolved = [each for each, power in zip(picture.bars, powers, strict=True) if power - noise / 2 > _RESOLVED * white]
+    floor = _RESOLVED * float(np.mean(levels.contrast[usable] ** 2))
+    bars = sorted(picture.bars, key=lambda each: _period_px(each.pattern))
+    resolved = [k for k, each in enumerate(bars) if float(np.mean(each.difference[usable] ** 2)) - noise / 2 > floor]
     if not resolved or np.count_nonzero(usable) < _MIN_BAR_PIXELS:
         return []
-    bars = min(resolved, key=lambda each: _period_px(each.pattern))
-    was, subject = bars.difference[usable], camera_label(session.name)
-    for _ in range(2):
-        with session.arm(sequence, light.exposure_s, 2):
-            lit, dark = (
-                session.capture_frames(sequence.patterns.index(each))[0].image[usable].astype(np.float32)
-                for each in (bars.pattern, bars.pattern.inverse)
-            )
-        change = math.sqrt(max(float(np.mean((lit - dark - was) ** 2)) - noise, 0) / float(np.mean(was**2)))
-        shown = f"bars of {_period_px(bars.pattern):g} px"
-        message = f"{shown} differ by {change:.0%} of their contrast from the same bars before"
-        # A picture that missed its refresh is shown again.
-        if change < _MAX_CHANGE:
-            return [ok("picture.steady", subject, message)]
+    subject = camera_label(session.name)
+    # Of a picture that was blurred, finer bars appear as it gets sharp.
+    for finest in bars[max(resolved[0] - 1, 0) : resolved[0] + 1]:
+        was = finest.difference[usable]
+        power = max(float(np.mean(was**2)), floor)
+        for _ in range(2):
+            with session.arm(sequence, light.exposure_s, 2):
+                lit, dark = (
+                    session.capture_frames(sequence.patterns.index(each))[0].image[usable].astype(np.float32)
+                    for each in (finest.pattern, finest.pattern.inverse)
+                )
+            again = lit - dark
+            change = math.sqrt(max(float(np.mean((again - was) ** 2)) - noise, 0) / power)
+            shown = f"bars of {_period_px(finest.pattern):g} px"
+            message = f"{shown} differ by {change:.0%} of their contrast from the same bars before"
+            # A picture that missed its refresh is shown again.
+            if change < _MAX_CHANGE:
+                break
+        else:
+            break
+    else:
+        return [ok("picture.steady", subject, message)]
+    share = float(np.mean(again * was)) / power
+    elsewhere = math.sqrt(max(float(np.mean((again - share * was) ** 2)) - noise, 0) / power)
+    if share > 0 and elsewhere < change * _ELSEWHERE:
+        message += f", earlier in this examination: they stand where they stood, with {share:.0%} of their contrast"
+        remedy = (
+            "its focus moves by itself, though autofocus is switched off or its focus is set: use another camera, or "
+            "fix the lens"
+        )
+        return [fault("picture.steady", subject, message, remedy)]
     remedy = (
-        "if its lens moves by itself, though autofocus is switched off or its focus is set: use another camera, or fix "
-        "the lens; switch image stabilisation off; if it is neither, see that camera, projector and object stand still"
+        "see that camera, projector and object stand still; switch image stabilisation off; if it is neither, the lens "
+        "moves by itself: use another camera, or fix the lens"
     )
     return [fault("picture.steady", subject, f"{message}, earlier in this examination", remedy)]
 

@@ -120,6 +120,15 @@ def test_doctor_advises_and_a_scan_takes_no_wrong_frame(name: str) -> None:
         )
 
 
+@pytest.mark.slow
+def test_a_lens_that_goes_to_and_fro_is_found_though_it_may_be_back_at_a_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.contract.v4l2_kernel.CREEPS_S", 5.0)
+    with bench(HABITS["moves its lens all the time"]) as (rig, _):
+        diagnosis = examine(rig, own_sequence=whole_scan(SIZE, period_px=8, line_width_px=1), search_s=0.1)
+    (steady,) = (each for each in diagnosis.findings if each.name == "picture.steady")
+    assert "its focus moves by itself" in steady.remedy
+
+
 @pytest.mark.parametrize("stamp", ["end", pytest.param("first packet", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("measured_s", "scanned_s"), [(0.15, 1 / 60), (1 / 60, 0.1)])
 def test_scan_at_another_exposure_than_the_latency_was_measured_at_takes_no_wrong_frame(

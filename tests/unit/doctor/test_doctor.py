@@ -457,9 +457,16 @@ def after(*steps: Process) -> Process:
     return process
 
 
-@parametrize_core(("process", "severity"), [(lambda image: image, Severity.OK), (blur, Severity.FAULT)])
+@parametrize_core(
+    ("process", "severity", "remedy"),
+    [
+        (lambda image: image, Severity.OK, ""),
+        (blur, Severity.FAULT, "its focus moves by itself"),
+        (lambda image: np.roll(image, 2, axis=1), Severity.FAULT, "see that camera, projector and object stand still"),
+    ],
+)
 def test_a_lens_that_moves_after_its_focus_was_measured_is_named(
-    rig: Rig, process: Process, severity: Severity
+    rig: Rig, process: Process, severity: Severity, remedy: str
 ) -> None:
     session, sequence = CameraSession(rig, "eye", wait_s=0.05), doctor_sequence(rig.projector.info.size)
     light, _ = measure_light(session, sequence, displays="")
@@ -468,6 +475,7 @@ def test_a_lens_that_moves_after_its_focus_was_measured_is_named(
     moved = with_camera(rig, change=lambda frame: replace(frame, image=process(frame.image)))
     [found] = check_steady(CameraSession(moved, "eye", wait_s=0.05), sequence, light, picture)
     assert (found.name, found.severity) == ("picture.steady", severity)
+    assert found.remedy.startswith(remedy)
 
 
 @pytest.fixture(scope="module")
