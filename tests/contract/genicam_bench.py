@@ -206,16 +206,13 @@ ACK = struct.Struct(">HHHH")
 
 
 class Relay:
-    """A GigE Vision camera at an address of its own. clock_ns : its clock, latched on request."""
+    """A GigE Vision camera at an address of its own, whose clock, the wall's, is latched on request."""
 
-    def __init__(
-        self, address: str = "127.0.0.2", camera: str = "127.0.0.1", *, clock_ns: Callable[[], int] = time.time_ns
-    ) -> None:
+    def __init__(self, address: str = "127.0.0.2", camera: str = "127.0.0.1") -> None:
         self.address = address
         self.latches: list[int] = []
         self.denied: set[int] = set()
         self._camera = (camera, PORT)
-        self._clock_ns = clock_ns
         self._host: tuple[str, int] | None = None
         self._near = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._near.bind((address, PORT))
@@ -264,7 +261,7 @@ class Relay:
         if register in self.denied:
             return ACK.pack(DENIED, command + 1, 0, request)
         if command == WRITE_REGISTER and register == LATCH:
-            self.latches.append(self._clock_ns())
+            self.latches.append(time.time_ns())
             return ACK.pack(0, command + 1, 4, request) + struct.pack(">I", 1)
         if command == READ_REGISTER and register in {HIGH, LOW} and self.latches:
             value = self.latches[-1] >> 32 if register == HIGH else self.latches[-1] & 0xFFFFFFFF

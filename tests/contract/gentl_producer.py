@@ -480,14 +480,12 @@ class Exposed:
 class MemoryCamera:
     """The camera. `deliver` takes each frame that leaves it.
 
-    first_frame : the number of the first frame after a start. without : features that it lacks. left : what another
-    program left of its features. stored : what its UserSet1 has. link : what it is on, by its GenTL
-    name.
+    without : features that it lacks. left : what another program left of its features. stored : what its UserSet1 has.
+    link : what it is on, by its GenTL name.
     """
 
     stage: Stage
     fate: Callable[[], Fate] = Fate
-    first_frame: int = 0
     without: tuple[str, ...] = ()
     left: Mapping[str, float] = field(default_factory=dict)
     stored: Mapping[str, float] = field(default_factory=dict)
@@ -564,7 +562,7 @@ class MemoryCamera:
         return self._values[name]
 
     def _run(self) -> None:
-        number = self.first_frame
+        number = 0
         never = threading.Event()
         while True:
             if self._values["TriggerMode"]:

@@ -120,9 +120,10 @@ class Stage:
 class StagedProjector:
     """Implements `slrig.devices.Projector` on a stage. It steps; it does not play."""
 
-    def __init__(self, stage: Stage, *, err_ns: int = 100_000) -> None:
+    _ERR_NS = 100_000
+
+    def __init__(self, stage: Stage) -> None:
         self._stage = stage
-        self._err_ns = err_ns
         self._state = ProjectorState("the staged projector")
 
     @property
@@ -138,8 +139,8 @@ class StagedProjector:
 
     def show(self, index: int) -> DisplayedPattern:
         at_ns = self._stage.show(self._state.require_pattern(index).profiles[index])
-        self._stage.clock.wait_until(at_ns + self._err_ns, self._state.closed)
-        return DisplayedPattern(index, at_ns, self._err_ns)
+        self._stage.clock.wait_until(at_ns + self._ERR_NS, self._state.closed)
+        return DisplayedPattern(index, at_ns, self._ERR_NS)
 
     def play(self, exposure_s: float, period_s: float) -> None:
         self._state.refuse_to_play(exposure_s, period_s)

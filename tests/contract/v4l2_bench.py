@@ -107,7 +107,6 @@ class Faked:
     rolling: bool = False
     sharp_at: int = 0
     jitter_s: float = 0.0
-    lag_frames: int = 3
     lost: float = 0.0
     corrupt: float = 0.0
     flags_corrupt: bool = True
@@ -122,7 +121,7 @@ class Faked:
     def config(self, light: Path, faults: Path) -> dict[str, Any]:
         keys = (
             *("rates_of", "driver", "line_s"),
-            *("formats", "rates", "controls", "stamp", "readout_s", "jitter_s", "lag_frames", "lost", "corrupt"),
+            *("formats", "rates", "controls", "stamp", "readout_s", "jitter_s", "lost", "corrupt"),
             *("flags_corrupt", "tells_rate", "stretches", "padding_bytes", "seed", "first_frame_s"),
         )
         most = max(width * height for sizes in self.formats.values() for width, height in sizes)

@@ -36,6 +36,7 @@ EXPOSURE_AUTO, EXPOSURE_ABSOLUTE, FOCUS, GAIN = 0x009A0901, 0x009A0902, 0x009A09
 EXPOSURE_LINES = 0x00980911
 READ_ONLY = 4
 PAGE = 4096
+LAG_FRAMES = 3
 MOST_BUFFERS = 32
 LONGEST_WAIT_NS = 5_000_000
 """A plain file is always ready to be polled, so an empty answer is held back a while, as `poll` would have waited."""
@@ -82,14 +83,14 @@ class Sensor:
     def start(self, period_ns: int, exposure_ns: int) -> None:
         self.period_ns = max(period_ns, exposure_ns) if self.config["stretches"] else period_ns
         self.begun_ns = self.now_ns() + round(self.config["first_frame_s"] * 1e9)
-        # The settings of the stream before are in use for a few frames yet.
+        # The settings of the stream before are in use for `LAG_FRAMES` yet.
         self.before_ns, self.exposure_ns = self.exposure_ns or exposure_ns, exposure_ns
         self.coming = self.drawn(0, 0)
 
     def drawn(self, number: int, not_before_ns: int) -> Shot:
         config = self.config
         start_ns = self.begun_ns + number * self.period_ns
-        exposure_ns = self.before_ns if number < config["lag_frames"] else self.exposure_ns
+        exposure_ns = self.before_ns if number < LAG_FRAMES else self.exposure_ns
         exposure_ns = min(exposure_ns, self.period_ns)
         late_ns = round(self.rng.random() * config["jitter_s"] * 1e9)
         done_ns = start_ns + exposure_ns + round(config["readout_s"] * 1e9) + late_ns

@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 
-from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraState, Clock, SystemClock, Trigger
+from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraState, SystemClock, Trigger
 from slrig.errors import FrameTimeoutError
 from slrig.model import Frame
 from tests.contract.stage import Stage
@@ -27,8 +27,7 @@ class Exposure:
 class WiredCamera:
     """Implements `Camera` on a stage: exposes by software trigger, or at each pulse on its wire. Thread-safe.
 
-    usual_s : its exposure until it is configured. exposures_s, gains : their ranges. readout_s : beside the next
-    exposure; what comes before the sensor is ready is lost. tells : whether the camera says how long that takes.
+    usual_s : its exposure until it is configured. exposures_s, gains : their ranges.
     """
 
     def __init__(
@@ -39,11 +38,8 @@ class WiredCamera:
         usual_s: float = 0.01,
         exposures_s: tuple[float, float] = (0.0005, 0.05),
         gains: tuple[float, float] = (1.0, 4.0),
-        readout_s: float = 0.0,
-        tells: bool = True,
-        clock: Clock | None = None,
     ) -> None:
-        self._stage, self._readout_s, self._tells, self._clock = stage, readout_s, tells, clock or SystemClock()
+        self._stage, self._clock = stage, SystemClock()
         triggers = frozenset({Trigger.SOFTWARE, Trigger.HARDWARE})
         self.info = CameraInfo(name, "wired", "0", stage.format, triggers, exposures_s, gains)
         self._lock, self._changed = threading.RLock(), threading.Event()
@@ -56,8 +52,7 @@ class WiredCamera:
         with self._lock:
             self._state.check_settings(settings, self.info)
             self._settings = settings
-            least_period_s = max(settings.exposure_s, self._readout_s) + WIRE_NS / 1e9
-            return AppliedSettings(settings.exposure_s, settings.gain, least_period_s if self._tells else None)
+            return AppliedSettings(settings.exposure_s, settings.gain, settings.exposure_s + WIRE_NS / 1e9)
 
     def arm(self, count: int, trigger: Trigger) -> None:
         with self._lock:
@@ -111,7 +106,7 @@ class WiredCamera:
             return
         self._room -= 1
         end_ns = begun_ns + round(self._settings.exposure_s * 1e9)
-        self._busy_until_ns = max(end_ns, begun_ns + round(self._readout_s * 1e9))
+        self._busy_until_ns = end_ns
         self._exposures.append(Exposure(self._number, begun_ns, end_ns))
         self._number += 1
         self._changed.set()

@@ -60,8 +60,6 @@ def run_in_guest(
     modules: Sequence[Module] = (),
     devices: Sequence[str] = (),
     timeout_s: float = 300.0,
-    memory_mib: int = 1536,
-    cores: int = 2,
     monitor: bool = False,
 ) -> Finished:
     """Boot, run one command in the checkout, power off.
@@ -83,7 +81,7 @@ def run_in_guest(
         *("timeout", "--kill-after=5", f"{timeout_s + 10:.0f}"),
         *(qemu, "-nodefaults", "-no-user-config", "-display", "none", "-no-reboot", "-nic", "none"),
         *("-machine", "q35", "-accel", "tcg,thread=multi", "-cpu", "max,la57=off"),
-        *("-smp", str(cores), "-m", str(memory_mib), "-serial", f"file:{console}"),
+        *("-smp", "2", "-m", "1536", "-serial", f"file:{console}"),
         *("-kernel", str(kernel.image), "-initrd", str(archive), "-append", _KERNEL_ARGUMENTS),
         *("-virtfs", f"local,path=/,mount_tag={HOST_TAG},security_model=none,readonly=on,multidevs=remap"),
         *("-virtfs", f"local,path={_escaped(share)},mount_tag={SHARE_TAG},security_model=none"),

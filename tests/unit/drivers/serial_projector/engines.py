@@ -63,12 +63,12 @@ class Scene:
 class FakeLight(BoxHardware):
     """A light engine in memory. drift : of its clock, a fraction. `broken` : the calls that fail."""
 
-    def __init__(self, scene: Scene, boot: int, *, drift: float = 0.0, broken: Sequence[str] = ()) -> None:
+    def __init__(self, scene: Scene, boot: int, *, drift: float = 0.0) -> None:
         self._scene, self._boot = scene, boot
         self._drift = drift
         self._since_ns = scene.now_ns()
         self._selected: int | None = None
-        self.broken = set(broken)
+        self.broken: set[str] = set()
         self.dims = True
         self.bright = 1000
 
