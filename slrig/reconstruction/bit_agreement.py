@@ -1,9 +1,9 @@
-"""Error of code edges that the bits show of one another.
+"""Error of code edges, by the disagreement of the bits.
 
 Edges of the bits alternate along a surface, so that each bit is measured between the edges of others. Light that
 spreads to one side (a translucent surface, coma), or something that moved between two frames, displaces the edges of
 one bit from those of the others. In blocks of the image a small surface is fitted to the positions of all edges, with a
-displacement of each of the finest bits. What displaces all bits alike does not show.
+displacement of each of the finest bits. A displacement of all bits alike is not visible.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ _MIN_POINTS, _MAX_POINTS = 20, 400  # of a bit in a block; of a block
 _CORRELATED_POINTS = 5  # whose errors a filter correlates along the stripe
 _MAX_SCATTER_CELLS = 0.25  # about the surface of a block; more is another surface
 _SIGNIFICANT = 4.0  # standard deviations of a displacement
-_MIN_DISPLACED_PX = 0.03  # less is within what is stated
+_MIN_DISPLACED_PX = 0.03  # less is within the stated deviation
 _ROUNDS = 3
 
 
 class BitAgreement(NamedTuple):
-    """What the edges of each bit say of the others.
+    """Displacement of each bit's edges from those of the others.
 
     displaced_px : (bits,) float64, median of the displacements of each bit where it is displaced, 0 without any.
-    sigma_px : (n,) float64, the standard deviation that they mean for each point, along its normal.
+    sigma_px : (n,) float64, the resulting standard deviation of each point, along its normal.
     """
 
     displaced_px: FloatArray

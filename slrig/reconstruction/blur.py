@@ -21,7 +21,7 @@ from slrig.reconstruction.phase import PositionMap
 # Chosen: 9 x 9 pixels add 1 % to the noise of a point, 5 x 5 add 10 %, and both together follow tight bends.
 _WIDE, _NARROW = 4, 2  # px either way
 # Clearance of a window from unusable pixels. At the projector's border the last usable pixels lack some light, which
-# looks like a bend.
+# resembles a bend.
 _MARGIN_PX = 1
 # Largest distance at which a pixel without a whole window uses that of a neighbour; a straight border needs 3.
 _NEIGHBOUR_PX = 4

@@ -6,7 +6,7 @@ pixel. The distance from that line is the residual, in projector pixels.
 
 The residuals determine five of the six parameters of the relative pose (not the length of the baseline), so that they
 show errors of depth, too: `fit_calibration` searches the smallest change of pose and lenses that explains them, and
-`CalibrationFit.displacement_mm` what it means for each point. If the residuals are larger than any small change,
+`CalibrationFit.displacement_mm` is its effect on each point. If the residuals are larger than any small change,
 `explain_residuals` tries mistakes that people and programs make, and names the one that brings agreement.
 
 Two cameras that decode both axes test their calibration in the same way without that of the projector: pixels that show
@@ -55,7 +55,7 @@ _MAX_CAUSES, _AS_SIMPLE = 2, 4  # causes to name, and free parameters between eq
 _IMPROVED = 0.7  # ratio of a cause's residual to that of the stated calibration
 _SIMPLER = 1.5  # a cause without free parameters is preferred up to this ratio of residuals
 _MAX_LENS_PX = 2.0  # residual of the best pose beyond which no small change of a lens helps
-_MAX_TURN_DEG = 20.0  # more is no device that moved a little
+_MAX_TURN_DEG = 20.0  # more is not a device that moved a little
 _STRIPE_SIGMA_PX = 0.1  # of a stripe point
 _LENS_PX = 1.0  # residual that lens models of two cameras may leave
 _MAX_STEP_PX = 4.0  # between neighbouring points of a stripe, to interpolate between them
@@ -96,8 +96,8 @@ class PixelPairs:
 def find_correspondences(ensemble: StripeEnsemble, second: SecondAxis, axis: Axis) -> PixelPairs:
     """Projector pixels of stripe points: by phase at up to 20 000 points, otherwise where stripes cross code edges.
 
-    axis : the one that numbers the stripes. None are returned where the second code is read at few of the points: what
-    is read there may be noise.
+    axis : the one that numbers the stripes. None are returned where the second code is read at few of the points: it
+    may be noise.
     """
     points = ensemble.points_px
     coded = np.repeat(ensemble.position_px, np.diff(ensemble.offsets))
@@ -107,7 +107,7 @@ def find_correspondences(ensemble: StripeEnsemble, second: SecondAxis, axis: Axi
         return read_pairs(ensemble, second.positions, axis, step=max(1, len(points) // _MAX_POINTS))
     index, share, other = second.edges(points, ensemble.ends)
     points = points[index] + share[:, None] * (points[index + 1] - points[index])
-    return _paired(points, coded[index], other, np.full(len(index), _EDGE_SIGMA_PX), axis)
+    return _make_pairs(points, coded[index], other, np.full(len(index), _EDGE_SIGMA_PX), axis)
 
 
 def read_pairs(ensemble: StripeEnsemble, positions: AxisPositions, axis: Axis, *, step: int = 1) -> PixelPairs:
@@ -118,10 +118,10 @@ def read_pairs(ensemble: StripeEnsemble, positions: AxisPositions, axis: Axis, *
     points = ensemble.points_px[::step]
     coded = np.repeat(ensemble.position_px, np.diff(ensemble.offsets))[::step]
     other, sigma = positions.sample(points)
-    return _paired(points, coded, other, sigma, axis).take(np.isfinite(other))
+    return _make_pairs(points, coded, other, sigma, axis).take(np.isfinite(other))
 
 
-def _paired(points: FloatArray, coded: FloatArray, other: FloatArray, sigma: FloatArray, axis: Axis) -> PixelPairs:
+def _make_pairs(points: FloatArray, coded: FloatArray, other: FloatArray, sigma: FloatArray, axis: Axis) -> PixelPairs:
     """coded, other : positions along the axis that numbers the stripes, and along the second one."""
     pair = (coded, other) if axis is Axis.COLUMN else (other, coded)
     return PixelPairs(points, np.column_stack(pair), sigma, axis)
@@ -188,7 +188,7 @@ def find_camera_pairs(first: PixelPairs, second: PixelPairs, cameras: tuple[Pinh
 
 @dataclass(frozen=True, slots=True)
 class DeviceNames:
-    """What messages call the two devices that are tested, and what each of them makes.
+    """Names in messages of the two devices that are tested, and of the image that each makes.
 
     is_pair : True if the second is a camera, too.
     """
@@ -216,7 +216,7 @@ _CAMERA_AND_PROJECTOR = DeviceNames()
 
 @dataclass(frozen=True, slots=True)
 class _RayPairs:
-    """Rays of both devices in the world, (n, 3) each, and what the epipolar distance needs."""
+    """Rays of both devices in the world, (n, 3) each, and the geometry for the epipolar distance."""
 
     camera: FloatArray
     projector: FloatArray
@@ -304,7 +304,7 @@ class CalibrationFit:
     camera, projector : as fitted, with the length of the baseline as it was; stated : the devices before. turned_deg,
     shifted_mm : motion of the projector relative to the camera. residual_px : median absolute residual afterwards.
     coded_error_px, coded_sigma_px : median error of the coded position by the stated calibration, and its standard
-    deviation. is_significant : True if the change is none that noise makes.
+    deviation. is_significant : True if the change is larger than noise makes.
     """
 
     stated: tuple[Pinhole, Pinhole]
@@ -331,11 +331,11 @@ class CalibrationFit:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationCheck:
-    """Residuals of both axes of one camera, and what explains them.
+    """Residuals of both axes of one camera, and their explanation.
 
     devices : camera and projector; axis : the one whose position gives the depth; pairs : number of points compared;
     sigma_px : median standard deviation of a residual by noise and resolution; median_px : median absolute residual;
-    systematic_px : rms of the means over the 8 x 8 cells of the image, less what noise adds. cause : mistake that
+    systematic_px : rms of the means over the 8 x 8 cells of the image, less the noise. cause : mistake that
     explains residuals that refute the calibration, empty if none is found or needed.
     """
 
@@ -358,7 +358,7 @@ class CalibrationCheck:
         limit_px = (
             _REFUTED_PX if self.explained else min(_REFUTED_PX, max(self.limit_px, _REFUTED_SIGMA * self.sigma_px))
         )
-        # Residuals that real lenses leave may imply any error where light sheets hardly cross the baseline.
+        # Residuals of real lenses may imply any error where light sheets hardly cross the baseline.
         is_large = self.systematic_px > _MAX_SYSTEMATIC_PX or self.median_px > 2 * max(
             self.sigma_px, _MAX_SYSTEMATIC_PX
         )
@@ -436,8 +436,8 @@ def check_calibration(
         return None
     devices = camera, projector
     median, sigma = disagreement_px(*devices, pairs), float(np.median(pairs.sigma_px))
-    # Cameras side by side hardly show how they are turned towards each other: a fit would explain what lenses leave by
-    # a turn of much larger effect.
+    # Cameras side by side hardly show how they are turned towards each other: a fit would explain the residuals of
+    # lenses by a turn of much larger effect.
     is_small = names.is_pair and median <= _LENS_PX
     fit = fit_calibration(*devices, pairs) if median <= 4 * _REFUTED_PX and not is_small else None
     systematic = _systematic_px(*devices, pairs) if fit is not None else median
@@ -476,7 +476,7 @@ def image_cells(pixels_px: FloatArray, size: Size, count: int) -> NDArray[np.int
 
 
 def _systematic_px(camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> float:
-    """Rms of the mean residuals of image cells, less what their noise adds."""
+    """Rms of the mean residuals of image cells, less their noise."""
     residual = epipolar_residual_px(camera, projector, pairs)
     limit = 5 * np.nanmedian(np.abs(residual))
     used = np.abs(residual) <= limit
@@ -492,7 +492,7 @@ def _systematic_px(camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> fl
     return float(np.sqrt(max(0.0, np.average(mean**2 - noise, weights=count))))
 
 
-def _turned(projector: Pinhole, camera: Pinhole, turn: FloatArray, aside: FloatArray) -> Pinhole:
+def _turn_projector(projector: Pinhole, camera: Pinhole, turn: FloatArray, aside: FloatArray) -> Pinhole:
     """The projector turned about its centre (rotation vector, rad), its baseline turned by two angles."""
     baseline = projector.centre_mm - camera.centre_mm
     length = linalg.norm(baseline)
@@ -513,9 +513,9 @@ def _with_lens(device: Pinhole, change: FloatArray) -> Pinhole:
     return replace(device, matrix=matrix, distortion=distortion)
 
 
-def _changed(camera: Pinhole, projector: Pinhole, x: FloatArray) -> tuple[Pinhole, Pinhole]:
+def _change_devices(camera: Pinhole, projector: Pinhole, x: FloatArray) -> tuple[Pinhole, Pinhole]:
     """Both devices with a change: (5,) of the pose, or (13,) with the lenses of both."""
-    moved = _turned(projector, camera, x[:3], x[3:5])
+    moved = _turn_projector(projector, camera, x[:3], x[3:5])
     return (camera, moved) if len(x) == 5 else (_with_lens(camera, x[5:9]), _with_lens(moved, x[9:]))
 
 
@@ -533,12 +533,12 @@ def fit_calibration(camera: Pinhole, projector: Pinhole, pairs: PixelPairs, /) -
     for count in (5, 13):
 
         def error(x: FloatArray) -> FloatArray:
-            residual = epipolar_residual_px(*_changed(camera, projector, x), pairs) / scale
+            residual = epipolar_residual_px(*_change_devices(camera, projector, x), pairs) / scale
             # The priors of the lenses weigh as much as one point each.
             return np.concatenate([np.nan_to_num(residual, nan=1e3), x[5:]])
 
         solved = least_squares(error, np.zeros(count), loss="soft_l1", x_scale="jac", max_nfev=60)
-        fitted = _changed(camera, projector, solved.x)
+        fitted = _change_devices(camera, projector, solved.x)
         median = disagreement_px(*fitted, pairs)
         if not np.isfinite(median):
             break
@@ -565,8 +565,8 @@ def _covariance(
     """Covariance of fitted parameters whose residuals are correlated in the image.
 
     H⁻¹ S H⁻¹ with H = JᵀJ and S the sum of gᵀg over image cells, g = Σ Jᵀr of a cell (Huber 1967, with clusters), and
-    of the same for a residual of `floor` in all points of each of 3 x 3 parts of the image: no lens is exactly what
-    its model says. The residuals after the first n are priors, each by itself.
+    of the same for a residual of `floor` in all points of each of 3 x 3 parts of the image: no lens follows its
+    model exactly. The residuals after the first n are independent priors.
     """
     count = len(pixels_px)
     cell = image_cells(pixels_px, size, _CELLS)
@@ -586,7 +586,7 @@ def _coded_error_px(
     axis = 0 if pairs.axis is Axis.COLUMN else 1
 
     def error(at: FloatArray) -> FloatArray:
-        devices = _changed(camera, projector, at)
+        devices = _change_devices(camera, projector, at)
         ray = pixel_rays(devices[0], pairs.camera_px)
         points = devices[0].centre_mm + coded_depth_mm(*devices, pairs)[:, None] * ray
         return np.asarray(project(projector, points)[:, axis] - pairs.projector_px[:, axis])
@@ -668,13 +668,13 @@ def _trials(
         yield _Mistake(f"the {names.image} is {name}", camera, projector, replace(pairs, projector_px=transformed))
     yield from _exchanged_bits(camera, projector, pairs, code)
     yield from _other_focal_lengths(camera, projector, pairs, names)
-    yield from _scaled(camera, projector, pairs, names.picture, of_camera=True)
-    yield from _scaled(camera, projector, pairs, names.code, of_camera=False, is_picture=names.is_pair)
+    yield from _scaled_pictures(camera, projector, pairs, names.picture, of_camera=True)
+    yield from _scaled_pictures(camera, projector, pairs, names.code, of_camera=False, is_picture=names.is_pair)
     if fit is not None and fit.turned_deg < _MAX_TURN_DEG:
         cause = (
-            f"{names.the(names.projector)} has another pose relative to {names.the(names.camera)} than the calibration "
-            f"says: turned by {fit.turned_deg:.2f}° and shifted by {fit.shifted_mm:.1f} mm"
-            + ("" if names.is_pair else " (a keystone correction looks the same)")
+            f"{names.the(names.projector)} has another pose relative to {names.the(names.camera)} than in the "
+            f"calibration: turned by {fit.turned_deg:.2f}° and shifted by {fit.shifted_mm:.1f} mm"
+            + ("" if names.is_pair else " (a keystone correction has the same effect)")
         )
         yield _Mistake(cause, fit.camera, fit.projector, pairs, 2)
 
@@ -710,7 +710,7 @@ def _other_poses(camera: Pinhole, projector: Pinhole, names: DeviceNames) -> Ite
 
 
 def _other_images(pixels: FloatArray, size: Size) -> Iterator[tuple[str, FloatArray]]:
-    """Pixels (n, 2) of a picture that was mirrored or turned before it came."""
+    """Pixels (n, 2) of a picture that was mirrored or turned before it was stored."""
     right, bottom = size.width_px - 1, size.height_px - 1
     x, y = pixels.T
     yield "mirrored left to right", np.column_stack([right - x, y])
@@ -781,7 +781,7 @@ def _minimise(residual: Callable[[FloatArray], FloatArray], starts: Sequence[Flo
     return np.asarray(min(solved, key=lambda each: each.cost).x)
 
 
-def _scaled(
+def _scaled_pictures(
     camera: Pinhole, projector: Pinhole, pairs: PixelPairs, name: str, *, of_camera: bool, is_picture: bool = True
 ) -> Iterator[_Mistake]:
     """A picture of another resolution, zoomed, shifted, or both: p' = s (p + ½) - ½ + shift."""

@@ -13,8 +13,7 @@ other steps need values proportional to light. The code determines γ: where a b
 middle of an edge, each has half of the projector's light, 2 m^γ = white^γ + black^γ. The same holds for lines of half
 their period and their inverses (`AxisFrames.line_pairs`), and for lines whose light adds up to the middle of white and
 black. Blur by lenses keeps that relation, and sharpening is the same on both sides of an edge. A projector or cable
-that blurs the signal before the projector's gamma loses light at edges, which looks like γ < 1; values then stay as
-they are.
+that blurs the signal before the projector's gamma loses light at edges, as γ < 1 would; values then stay as they are.
 """
 
 from __future__ import annotations

@@ -55,13 +55,13 @@ _MIN_POINTS = 100  # of edges there
 _CORRELATED_POINTS = 5  # whose errors a filter correlates along the stripe
 _SIGNIFICANT = 4.0  # standard deviations of a mean
 _SKEW = 1.4  # over the first order, of light that falls off exponentially to one side
-_MIN_SKEW_PX, _MAX_SKEW_PX = 0.01, 2.0  # less is within what is stated, more is no edge by itself
+_MIN_SKEW_PX, _MAX_SKEW_PX = 0.01, 2.0  # less is within the stated deviation, more is an edge close to others
 _CLIPPED_SHIFT = 1.5  # over the shift by the smoothed second derivative, which is smaller than that of the light
 
 
 @dataclass(frozen=True, slots=True)
 class CodeTables:
-    """Projector positions that the code words of a pattern sequence stand for.
+    """Projector positions of the code words of a pattern sequence.
 
     index_of_word : (2^bits,) int32; cell_position : (cells,) float64, px; position_table : (frames, cells) float64, px,
     of lines or of code edges; edge_table : (bits, cells) float64, px, of the code edges that replace unresolved lines,
@@ -317,7 +317,7 @@ def _edge_middle(
     high, low = cv2.dilate(smooth, box), cv2.erode(smooth, box)
     swing, middle = high - low, (high + low) / 2
     inside = cv2.erode(lit.view(np.uint8), box, borderValue=0) > 0
-    # Pixels beside the point where the bit crosses the middle.
+    # Pixels next to the point where the bit crosses the middle.
     crossing = cv2.morphologyEx((smooth > middle).view(np.uint8), cv2.MORPH_GRADIENT, _CROSS) > 0
     weight = (inside & crossing & (swing > _MIN_EDGE_SWING)).astype(np.float32)
     count = np.maximum(cv2.blur(weight, (_AROUND_PX, _AROUND_PX)), np.float32(1e-6))

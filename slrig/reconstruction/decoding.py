@@ -39,7 +39,7 @@ _REACH_PX = 8
 BLOCK_PX = 32
 """Size of a block: small enough for an even density of the code, with hundreds of passages of each bit."""
 _MIN_PASSAGES = 48
-"""With fewer passages, a block does not tell whether it resolves a bit, and its neighbours do."""
+"""With fewer passages, a block does not show whether it resolves a bit, and its neighbours decide."""
 _MIN_CORRECT = 0.7
 """Least share of passages (runs of pixels of one cell between its neighbours) in which the bit changes once, the right
 way. Random bits do in a quarter."""
@@ -160,7 +160,7 @@ def _require_bits_left(bits: int, dropped: int) -> None:
     if dropped and bits - dropped < _MIN_BITS_LEFT:
         message = (
             f"{setting('drop_finest_bits')}: expected at most {max(bits - _MIN_BITS_LEFT, 0)} for a code of {bits} "
-            f"bits, found {dropped}; {_MIN_BITS_LEFT} bits at least say where a pixel is"
+            f"bits, found {dropped}; at least {_MIN_BITS_LEFT} bits are needed to locate a pixel"
         )
         raise PatternError(message)
 
@@ -367,7 +367,7 @@ def unresolved_bits(frames: AxisFrames, lit: NDArray[np.bool_], /) -> NDArray[np
         lost = enough & (
             (correct < _MIN_CORRECT * long_passages) | (pixels < _MIN_PASSAGE_PX * passages) | (swing < _MIN_SWING)
         )
-        # Stripes of the next finer bit, where it does not tell by itself, are half as wide.
+        # Stripes of the next finer bit are half as wide, where its own passages are too few.
         finer_narrow = enough & ~lost & ~finer_enough & (pixels < 2 * _MIN_PASSAGE_PX * passages)
         judged |= enough & open_blocks
         open_blocks &= lost | finer_lost | finer_narrow
@@ -404,8 +404,8 @@ def _mean_swing(
 
 
 def _follow_neighbours(unresolved: NDArray[np.uint8], judged: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Counts of the blocks, (rows, columns): a block that does not tell takes those of the blocks around it, and none
-    has more, or fewer, than all its neighbours.
+    """Counts of the blocks, (rows, columns): a block with too few passages takes those of the blocks around it, and
+    none has more, or fewer, than all its neighbours.
     """
     if not judged.any() or judged.size == 1:
         return unresolved

@@ -94,7 +94,7 @@ class SampleFormat(NamedTuple):
 
 
 def sample_format(images: Iterable[NDArray[Any]], full_scale: float) -> SampleFormat:
-    """Find how 16-bit images use their words; for other images, or few different values, as `full_scale` says.
+    """Find how 16-bit images use their words; for other images, or few different values, return `full_scale`.
 
     Cameras of 10 to 14 bits fill the upper bits of a word, whose lowest ones are then 0, or the lower ones. The step is
     the least difference of values. Full scale is that of the fewest usual bits which hold all values, if so many of
@@ -220,8 +220,8 @@ class AxisPatterns:
     """Patterns of one axis that one camera captures, in the order for decoding.
 
     gray : the code, as its first bit, or cells of one position without; direct, inverted : bits shown so; lines : by
-    shift; reference : White and Black, as far as they are shown. sines : of sinusoids, by period and shift; none beside
-    lines.
+    shift; reference : White and Black, as far as they are shown. sines : of sinusoids, by period and shift; none where
+    there are lines.
     """
 
     gray: Gray

@@ -3,9 +3,9 @@
 A projector ray meets one surface point, so on a light sheet depth is a function of the projector row. Curves of one
 position from two cameras sample the same function, and are merged by row. Where both have it, the point is the mean
 weighted by inverse variance. Where only one has it, it fills the gap. The result is never two sheets. Further cameras
-are merged one after another. Fused points stand where the earlier camera has them, so the camera that samples the
-sheets most finely comes first: one of low resolution must not thin out what the others measure. Cameras that contradict
-each other must not be merged: `redundancy` tells.
+are merged one after another. Fused points are at the rows of the earlier camera, so the camera that samples the sheets
+most finely comes first: one of low resolution must not thin out the points of the others. Cameras that contradict each
+other must not be merged: `redundancy` detects them.
 """
 
 from __future__ import annotations

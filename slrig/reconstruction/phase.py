@@ -48,12 +48,12 @@ _SHADOW_SHARE = 0.5  # of the displacement by fading light, chosen for shadows o
 
 _MEAN_PX = 17  # window over which the squared displacements by asymmetric light are averaged
 _MIN_EXCESS = 2.5  # standard deviations of that average beyond its noise
-_USUAL_SHARE = 0.25  # of the lit pixels have no light from other surfaces, as far as one scan can say
-_MIN_HARMONIC = 0.2  # of the amplitude of narrow lines: below, the harmonic says nothing of the line
+_USUAL_SHARE = 0.25  # of the lit pixels have no light from other surfaces, as far as one scan can show
+_MIN_HARMONIC = 0.2  # of the amplitude of narrow lines: below, the harmonic is not that of the line
 
 _QUANTILE_STEP = 7  # of the pixels
 _MAX_MOVED_PX = 0.02  # projector px, by changes of brightness; a harmonic of threefold frequency moves as much again
-_MIN_KNOWN = 0.1  # share of a window whose pixels say something
+_MIN_KNOWN = 0.1  # share of the pixels of a window that are measured
 _TINY = np.float32(1e-6)
 
 _SHADOW_SIGMA = 3.0
@@ -266,8 +266,8 @@ def centroid_residual_px(
     pixels.
 
     It is the third order where brightness changes as sharply as the blur allows, ∂³ ln L = ∂ ln L / σ²: the share
-    σ²ω²s²/6 of the first-order displacement, with either sign. Beside shadows it is at least `_SHADOW_SHARE` of it,
-    since the light of the projector fades there by itself, too.
+    σ²ω²s²/6 of the first-order displacement, with either sign. Next to shadows it is at least `_SHADOW_SHARE` of it,
+    since the light of the projector itself fades there.
     """
     down, across = np.gradient(measured.position)
     share = (blur_px * 2 * np.pi / period_px) ** 2 / 6  # over s², and in projector px over s
@@ -278,11 +278,11 @@ def centroid_residual_px(
     window = (_FITTED_PX, _FITTED_PX)
     mean = cv2.blur(squared, window)
     if near_shadow.any():
-        # A fit beside a border has pixels on one side only.
-        beside = cv2.dilate(near_shadow.view(np.uint8), np.ones((2 * _FITTED_PX - 1,) * 2, np.uint8)) > 0
-        beside &= usable & np.isfinite(displaced_squared) & (slope_squared > MIN_GRADIENT**2)
-        of_shadow = np.divide(displaced_squared, slope_squared, out=np.zeros_like(squared), where=beside)
-        pixels = cv2.blur(beside.astype(np.float32), window)
+        # A fit next to a border has pixels on one side only.
+        near_border = cv2.dilate(near_shadow.view(np.uint8), np.ones((2 * _FITTED_PX - 1,) * 2, np.uint8)) > 0
+        near_border &= usable & np.isfinite(displaced_squared) & (slope_squared > MIN_GRADIENT**2)
+        of_shadow = np.divide(displaced_squared, slope_squared, out=np.zeros_like(squared), where=near_border)
+        pixels = cv2.blur(near_border.astype(np.float32), window)
         mean += _SHADOW_SHARE**2 * cv2.blur(of_shadow, window) / np.maximum(pixels, np.float32(1 / _FITTED_PX**2))
     return np.asarray(np.sqrt(np.maximum(mean, 0)), dtype=np.float32)  # running sums may round to below 0
 
@@ -296,8 +296,8 @@ def asymmetry_sigma_px(
     A line that lights a pixel straight from the projector is symmetric about its centre with any blur and response:
     the phases of its harmonics agree. Light that comes by way of another surface displaces each harmonic in its own
     way; the difference between the positions by a higher and by the first one is about as large as the displacement
-    by the first. Counted where noise does not explain it, beyond what most of the image shows. Pixels whose brightness
-    changes sharply, as `centred` (from `resample_to_pixel_centres`) tells, say nothing: it makes lines asymmetric, too.
+    by the first. Counted where noise does not explain it, beyond the usual value of the image. Pixels whose brightness
+    changes sharply (by `centred`, from `resample_to_pixel_centres`) are left out: it makes lines asymmetric, too.
     """
     patterns = frames.line_patterns
     if not patterns:  # sinusoids have no harmonics
@@ -310,7 +310,7 @@ def asymmetry_sigma_px(
         return difference
     turn = 2 * np.pi * order / period_px
     angle = turn * np.array([each.centre_px for each in patterns])
-    # A line wider than half a wave of the harmonic has it upside down.
+    # A line wider than half a wave of the harmonic inverts it.
     offset = 0.0 if amplitudes[order] > 0 else np.pi
 
     sums = np.array([np.cos(angle), np.sin(angle), np.full(count, 1 / count)], dtype=np.float32)

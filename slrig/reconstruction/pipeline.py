@@ -88,7 +88,7 @@ _REACH_PX = 16  # of the widest filter, 9 px, and of a point's offset from its p
 _MIN_SAMPLED_POINTS = 4_000  # of a frame: their median is known to a thirtieth of their scatter
 _BAND_ROWS, _MAX_BAND_SPACING = 8, 16  # rows of a sampled band; a band in so many at least
 _MIN_FILTER_ONLY_PX = 2.0  # a filter so wide sums more pixels than the fit to the phase, and has less noise
-# Long periods in little light scatter: of a dark surface, points of 1 px are most of what there is, and σ says so.
+# Long periods in little light scatter: most points of a dark surface have a σ of about 1 px, and state it.
 _SINUSOID_POINTS = {"start_sigma_px": np.inf, "coarsest_px": 1.0}
 _MIN_SMOOTHED_PX = 1.4  # stripe and filter together: see `_matched_scale_px`
 
@@ -99,16 +99,16 @@ class CameraCurves:
 
     refusal : (H, W) uint8, `Refusal`; stripe_points, stripe_count : before linking. refined : True if the points are
     those of `refinement.refine_points`; disagreement_px : as in `refinement.Refinement`, empty without phase.
-    bits_displaced_px : as in `bit_agreement.BitAgreement`, empty where all points are of lines.
-    unresolved : (H, W) uint8, number of finest bits left out at each pixel; None where bits only number lines.
-    unresolved_lines : (H, W) bool, where code edges replace lines that the camera does not resolve; None if nowhere.
-    compression_dn : standard deviation of white noise that displaces positions as much as the loss by compression; 0
-    for frames without loss. noise_correlation, gamma : as in `camera_response.CameraResponse`. sinusoids : how light
-    follows the values of sinusoids, None without. beyond_pixels : number
-    of pixels whose code names a cell that the projector has not; furthest_cell : of these cells, the one farthest from
-    the projector's that more than a hundredth of the pixels name, -1 without any. light_from_surfaces : as
-    `decoded_image.light_from_surfaces` returns it. clipped_white, clipped_code : number of lit pixels that are clipped
-    in white, and in a frame of the code. sample_step, full_scale : as in `frames.SampleFormat`.
+    bits_displaced_px : as in `bit_agreement.BitAgreement`, empty where all points are of lines. unresolved : (H, W)
+    uint8, number of finest bits left out at each pixel; None where bits only number lines. unresolved_lines : (H, W)
+    bool, where code edges replace lines that the camera does not resolve; None if nowhere. compression_dn : standard
+    deviation of white noise that displaces positions as much as the loss by compression; 0 for frames without loss.
+    noise_correlation, gamma : as in `camera_response.CameraResponse`. sinusoids : relation of light to the values of
+    sinusoids, None without. beyond_pixels : number of pixels whose code names a cell that the projector does not have;
+    furthest_cell : of these cells, the one farthest from the projector's that more than a hundredth of the pixels name,
+    -1 without any. light_from_surfaces : as `decoded_image.light_from_surfaces` returns it. clipped_white, clipped_code
+    : number of lit pixels that are clipped in white, and in a frame of the code. sample_step, full_scale : as in
+    `frames.SampleFormat`.
     """
 
     ensemble: StripeEnsemble
@@ -202,7 +202,7 @@ class CameraStream:
         image = self._advance()
         if image is None or self._curves is None:
             missing = sorted(map(repr, self._stacks.missing))
-            message = f"{len(missing)} of the frames announced did not come: {'; '.join(missing)}; capture them again"
+            message = f"{len(missing)} of the frames announced are missing: {'; '.join(missing)}; capture them again"
             raise PatternError(message)
         white, black = self._reference
         return self._curves, replace(image.frames, white=white, black=black)

@@ -35,7 +35,7 @@ MAX_SHIFT = 0.05
 _TURN_RAD = np.deg2rad(1.0)  # standard deviation of a bump before anything is measured
 _SHIFT = 0.01  # the same for its shift, as a part of the baseline
 _POINTS = 15_000  # of each camera, on whole curves
-_EQUATIONS = 5000  # of a pair: neighbours along a stripe share most of their light, and tell little more
+_EQUATIONS = 5000  # of a pair: neighbours along a stripe share most of their light, and add little
 _ROUNDS = 30
 _MOST_STEP = 0.5  # of each parameter in one round: farther, wrong neighbours lead the search astray
 _STEP = 1e-3  # of the parameters, for derivatives: a hundredth of a pixel
@@ -47,8 +47,8 @@ class RefinedPose:
     """Pose of one device that makes cameras agree.
 
     device : index among the cameras; their number for the projector. turn_deg : angle between both poses; shift_mm :
-    distance between both centres. covariance : (15, 15) float64, of the parameters of `SolveRecord`, zero but for the
-    pose. equations : number of equations; scatter_sigma : robust standard deviation of r / σ that is left.
+    distance between both centres. covariance : (15, 15) float64, of the parameters of `SolveRecord`, zero except for
+    the pose. equations : number of equations; scatter_sigma : robust standard deviation of r / σ that is left.
     """
 
     device: int
@@ -98,7 +98,7 @@ def refine_pose(
     parameters, left = np.zeros(6), np.inf
 
     def poses(values: FloatArray) -> list[Pinhole]:
-        return [_moved(each, values * scale) if k == moved else each for k, each in enumerate(devices)]
+        return [_move_device(each, values * scale) if k == moved else each for k, each in enumerate(devices)]
 
     for _ in range(_ROUNDS):
         equations = _match(ensembles, poses(parameters), axis, pairs, widest_gap_px)
@@ -171,7 +171,7 @@ def _is_small(turn: FloatArray, shift_mm: FloatArray, baseline_mm: float, *, fac
     )
 
 
-def _moved(device: Pinhole, motion: FloatArray) -> Pinhole:
+def _move_device(device: Pinhole, motion: FloatArray) -> Pinhole:
     """The device turned about its centre by a rotation vector, rad, and shifted, mm, (6,), in its own frame."""
     rotation = np.asarray(cv2.Rodrigues(motion[:3])[0]) @ device.rotation
     centre_mm = device.centre_mm + device.rotation.T @ motion[3:]
@@ -179,7 +179,7 @@ def _moved(device: Pinhole, motion: FloatArray) -> Pinhole:
 
 
 def _parameter_covariance(pose: Pinhole, covariance: FloatArray) -> FloatArray:
-    """(15, 15): covariance (6, 6) of `_moved` in the parameters of `SolveRecord`, R' X + t: dt = turn x t - shift."""
+    """(15, 15): covariance (6, 6) of a motion in the parameters of `SolveRecord`, R' X + t: dt = turn x t - shift."""
     x, y, z = pose.translation_mm
     motion = np.zeros((DEVICE_PARAMETERS, 6))
     motion[9:12, :3] = np.eye(3)

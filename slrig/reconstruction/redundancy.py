@@ -1,9 +1,9 @@
-"""Redundant equations of cameras that see the same light sheets, and what they say of the calibration.
+"""Redundant equations of cameras that see the same light sheets, as a test of the calibration.
 
 A point that one camera and the projector measure has a projection in every other camera, which sees the same stripe:
-the distance across that stripe is an equation to spare, px. Its standard deviation is stated by the noise of both
+the distance across that stripe is a redundant equation, px. Its standard deviation is stated by the noise of both
 stripes and by the covariance of the calibration. Cameras contradict each other where the distances, as medians of
-small areas, exceed what is stated: noise has no median, whether its size is stated rightly or not.
+small areas, exceed the stated deviations: noise has no median, whether its size is stated correctly or not.
 """
 
 from __future__ import annotations
@@ -69,10 +69,10 @@ class PairRedundancy:
     `outlying` only. stated_rms_px : rms to expect from the stated deviations with a perfect calibration. map_mean_px,
     map_rms_px : (6, 6) float64, NaN where fewer than 20 pairs are; map_pairs : (6, 6) int32. residuals : the equations
     of all points. calibration_px : median standard deviation of an equation by the stated covariance of the
-    calibration, 0 without one. over_stated : robust standard deviation of all equations, as a multiple of what noise
-    and calibration state. contradiction : the same of the medians of small cells of the projector's image, as a
-    multiple of the larger of what is stated and the scatter about the medians, at most 0.5 px; 0 for fewer than 100
-    points.
+    calibration, 0 without one. over_stated : robust standard deviation of all equations, as a multiple of the deviation
+    that noise and calibration state. contradiction : the same of the medians of small cells of the projector's image,
+    as a multiple of the larger of the stated deviation and the scatter about the medians, at most 0.5 px; 0 for fewer
+    than 100 points.
     """
 
     reference: str
@@ -93,7 +93,7 @@ class PairRedundancy:
 
     @property
     def is_contradicted(self) -> bool:
-        """True if the calibration does not explain what the two cameras measure."""
+        """True if the calibration does not explain the measurements of the two cameras."""
         return self.contradiction > MAX_OVER_SIGMA
 
 

@@ -189,7 +189,7 @@ class Refinement:
     normals, less three standard deviations of that median; NaN for a frame without any. It is close to 0 if the light
     was the same in all frames. accepted : False if it was not, and the points are those of the filter.
     frame_sigma_px : (frames,) float64, standard deviation of the error that all points of a frame share, because its
-    lines lie beside those of the others; `sigma_px` of the points does not contain it.
+    lines are displaced from those of the others; `sigma_px` of the points does not contain it.
     """
 
     points: list[LinePoints]
@@ -317,7 +317,7 @@ def _subsample(values: FloatArray, valid: NDArray[np.bool_]) -> FloatArray:
 
 
 def _significant_median(distance: FloatArray) -> float:
-    """Median, less three of its own standard deviations, as few or noisy points say little. NaN without values."""
+    """Median, less three of its own standard deviations, as few or noisy points prove little. NaN without values."""
     if not len(distance):
         return np.nan
     median = float(np.median(distance))
@@ -345,10 +345,10 @@ def _phase_gains(frames: int) -> FloatArray:
 
 
 def _frame_displacements(distance_px: FloatArray) -> tuple[FloatArray, float]:
-    """Displacement of the lines of each frame, (frames,) px, and the standard deviation of what they share, px.
+    """Displacement of the lines of each frame, (frames,) px, and the standard deviation of their common part, px.
 
     Lines displaced by d move the phase by G d (`_phase_gains`): their distance from it is (1 - G) d, NaN without any.
-    A displacement of all frames alike does not show; if they are independent, its variance is that of one over their
+    A displacement of all frames alike is not visible; if they are independent, its variance is that of one over their
     number.
     """
     frames = len(distance_px)

@@ -1,4 +1,4 @@
-"""Light of the second axis: a spare equation at each pixel.
+"""Light of the second axis: a redundant equation at each pixel.
 
 Where columns and rows were played, one axis and the camera ray determine a point. The other axis then measures a
 coordinate that the calibration predicts: the point's position along its light sheet. Their difference contains errors
@@ -84,8 +84,8 @@ class SecondAxis:
     def edges(self, points_px: FloatArray, ends: NDArray[np.bool_]) -> AxisEdges:
         """Find where stripes cross code edges of this axis.
 
-        points_px : (n, 2) float64, points of stripes in order; ends : (n,) bool, True where the next point is no
-        neighbour. A crossing belongs to the edge nearest to what `positions` says there.
+        points_px : (n, 2) float64, points of stripes in order; ends : (n,) bool, True where the next point is not a
+        neighbour. A crossing belongs to the edge nearest to the value of `positions` there.
         """
         frames = self.frames
         approximate, _ = self.positions.sample(points_px)
@@ -112,9 +112,9 @@ def find_crossings(
     """Find where a value along stripes changes its sign: index of the point before, (n,), and share of the way to the
     next point, (n,) from 0 to 1.
 
-    points_px : (N, 2); ends : (N,) bool, True where the next point is no neighbour; value : (N,). Two points on either
-    side have to agree. The root is that of the straight line between two points, corrected by the second differences
-    around them.
+    points_px : (N, 2); ends : (N,) bool, True where the next point is not a neighbour; value : (N,). Two points on
+    either side have to agree. The root is that of the straight line between two points, corrected by the second
+    differences around them.
     """
     ends = ends.copy()
     ends[:-1] |= np.linalg.norm(np.diff(points_px, axis=0), axis=1) > _MAX_SPACING_PX
@@ -160,7 +160,7 @@ class AxisResiduals:
     sigma_px: FloatArray
 
     def contradicted(self, systematic_px: float = 0.0) -> NDArray[np.bool_]:
-        """(n,) bool: points whose light came from another place than their column says.
+        """(n,) bool: points whose light came from another place than that of their column.
 
         systematic_px : error of the calibration to allow for.
         """

@@ -2,18 +2,18 @@
 
 A pixel of a camera and the pixel of the projector that shows the same point fulfil one equation: the projector pixel is
 on the epipolar line of the camera pixel. One scan by columns and rows has 10^5 of them. They determine the relative
-pose but for the length of the baseline, and, with what is known beforehand of focal lengths and principal points, the
-lenses (Hartley and Zisserman, Multiple View Geometry, 2004, chapters 9 and 19).
+pose except for the length of the baseline, and, with prior knowledge of focal lengths and principal points, the lenses
+(Hartley and Zisserman, Multiple View Geometry, 2004, chapters 9 and 19).
 
 `self_calibrate` minimises Σ ρ((r / σ)²) / e + zᵀ z: r the distance from the epipolar line, projector pixels; ρ(x) =
 2 √(1 + x) − 2; z the change of all parameters in standard deviations of what was known before (a prior of mean 0 and
 covariance L Lᵀ, change = L z). Parameters without prior variance stay. The same function therefore starts from rough
 guesses of a new rig, and improves a calibration that a board gave.
 
-Residuals of neighbours are alike, because no lens is exactly what its model says. e is the design effect of that, and
-the covariance is (1 + Jᵀ W J)⁻¹ with it. It determines the error of shape: the rms by which points move when the
-parameters are drawn from it, after the best similarity, over the size of the scene. Views from one place and focal
-lengths that are hardly known lead to a large one, and are refused by it. A flat scene has two solutions
+Residuals of neighbours are alike, because no lens follows its model exactly. e is the design effect of that, and the
+covariance is (1 + Jᵀ W J)⁻¹ with it. It determines the error of shape: the rms by which points move when the parameters
+are drawn from it, after the best similarity, over the size of the scene. It is large, and the result is refused, for
+views from one place and focal lengths that are hardly known. A flat scene has two solutions
 (Longuet-Higgins 1986), and is refused as such.
 """
 
@@ -43,7 +43,7 @@ _MOST_DAMPING, _PROBE, _MOST_BEND = 1e9, 0.1, 0.75
 _PIXEL_SIGMA_PX = 0.05  # of the coordinate that numbers the stripes
 _LOSS_SCALE = 2.0  # of soft L1, in standard deviations
 _CELLS, _LENS_CELLS = 8, 3  # along each side of the image
-_LENS_FLOOR_PX, _FLOOR_RATIO = 0.005, 3.0  # no lens is exactly what its model says
+_LENS_FLOOR_PX, _FLOOR_RATIO = 0.005, 3.0  # no lens follows its model exactly
 _MIN_IN_CELL = 20
 _USUAL_EFFECT = 30.0  # design effect before there is an estimate
 _MIN_IN_FRONT = 0.95
@@ -56,7 +56,7 @@ _WIDE_TURN_RAD = 0.6  # of a pose that was found from the pairs: no knowledge fr
 
 @dataclass(frozen=True, slots=True)
 class DeviceGuess:
-    """What is known of a device before it is calibrated.
+    """Prior knowledge of a device, before it is calibrated.
 
     focal_px : focal length; focal_sigma : its relative standard deviation. shift_px : place of the principal point from
     the middle of the image, (x, y). shift_sigma_px : its standard deviations.
@@ -111,8 +111,8 @@ class SelfCalibration:
     size, one standard deviation. size_mm : diagonal of the box around the scene. volume_mm : (2, 3) float64, that box.
     error_mm : shape_error as a length. pairs : number used. residual_px : robust standard deviation of the distances
     from epipolar lines. changes : of each device, relative change of the focal length and shift of the principal point
-    in px, (3,) float64. contradiction : robust standard deviation of the distances from the epipolar lines of before,
-    over what the prior covariance and the noise explain: about 1 where these hold.
+    in px, (3,) float64. contradiction : robust standard deviation of the distances from the prior's epipolar lines,
+    over that which the prior covariance and the noise explain: about 1 where these hold.
     """
 
     calibration: Calibration
@@ -142,9 +142,9 @@ def self_calibrate(
 ) -> SelfCalibration:
     """Calibrate cameras and projector from the pairs of one or more scans.
 
-    prior, covariance : what is known before, (15 d, 15 d). scans : of each, the pairs of its cameras by name.
-    baseline_mm : distance of the first camera from the projector; where it is given, the poses of `prior` count for
-    nothing, and are found from the pairs. most_error : stated error of shape beyond which the result is refused.
+    prior, covariance : prior knowledge, (15 d, 15 d). scans : of each, the pairs of its cameras by name.
+    baseline_mm : distance of the first camera from the projector; where it is given, the poses of `prior` are ignored
+    and found from the pairs. most_error : stated error of shape beyond which the result is refused.
 
     Raises
     ------
@@ -152,7 +152,7 @@ def self_calibrate(
         There are too few pairs, none of the starts brings points in front of both devices, or the pairs leave the shape
         open.
     """
-    problem = without_poses = _Problem.of(prior, covariance, scans)
+    problem = without_poses = _Problem.build(prior, covariance, scans)
     start = np.zeros(problem.free)
     if baseline_mm is not None:
         problem, start = _from_nothing(problem, baseline_mm)
@@ -160,9 +160,9 @@ def self_calibrate(
     # Once: a large effect lets the prior draw the solution off, and what that leaves would make it larger still.
     effect, contradiction, start = problem.design_effect(solved), problem.contradiction(solved), solved.z
     if baseline_mm is not None:
-        # About the poses that were found, the length of the baseline is what was given.
+        # About the poses that were found, the baseline has the given length.
         lenses = start[: without_poses.free]
-        problem, start = without_poses.placed(problem.devices(start), lenses, baseline_mm)
+        problem, start = without_poses.at_poses(problem.devices(start), lenses, baseline_mm)
     solved = problem.solve(_POINTS, start, effect)
     devices = problem.devices(solved.z)
     share = problem.share_in_front(devices)
@@ -174,10 +174,10 @@ def self_calibrate(
         )
         raise SolveRefusedError(message)
     found = problem.result(prior, solved, contradiction)
-    # A plane has two solutions, and the covariance of one says nothing of the other.
+    # A plane has two solutions, and the covariance of one does not contain the other.
     if found.shape_error <= most_error and not (baseline_mm is not None and problem.thickness(devices) < _FLAT):
         return found
-    raise SolveRefusedError(_open_words(problem, devices, found, most_error))
+    raise SolveRefusedError(_explain_open_shape(problem, devices, found, most_error))
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,16 +205,16 @@ class _Problem:
     blocks: list[tuple[int, PixelPairs]]
 
     @classmethod
-    def of(cls, prior: Calibration, covariance: FloatArray, scans: Sequence[Mapping[str, PixelPairs]]) -> _Problem:
+    def build(cls, prior: Calibration, covariance: FloatArray, scans: Sequence[Mapping[str, PixelPairs]]) -> _Problem:
         if prior.projector is None:
             message = "a calibration without a projector has no pairs of both axes; calibrate the projector, too"
             raise SolveRefusedError(message)
         order = list(prior.cameras)
         blocks = [(order.index(name), _usable(pairs)) for scan in scans for name, pairs in scan.items()]
-        seen = {index for index, pairs in blocks if len(pairs) >= _MIN_PAIRS}
-        if len(seen) < len(order):
-            missing = [name for index, name in enumerate(order) if index not in seen]
-            most = max([len(pairs) for index, pairs in blocks if index not in seen], default=0)
+        usable = {index for index, pairs in blocks if len(pairs) >= _MIN_PAIRS}
+        if len(usable) < len(order):
+            missing = [name for index, name in enumerate(order) if index not in usable]
+            most = max([len(pairs) for index, pairs in blocks if index not in usable], default=0)
             message = (
                 f"camera {', '.join(map(repr, missing))}: expected at least {_MIN_PAIRS} pixels at which columns and "
                 f"rows were decoded, found {most}; play both axes, and light more of what the camera sees"
@@ -231,20 +231,20 @@ class _Problem:
         changes = (self.root @ z).reshape(-1, DEVICE_PARAMETERS)
         return tuple(_changed(device, change) for device, change in zip(self.before, changes, strict=True))
 
-    def placed(self, devices: Sequence[Pinhole], lenses: FloatArray, baseline_mm: float) -> tuple[_Problem, FloatArray]:
+    def at_poses(self, posed: Sequence[Pinhole], lenses: FloatArray, baseline_mm: float) -> tuple[_Problem, FloatArray]:
         """The problem about poses that have no prior but the length of the first baseline, and a start of its z.
 
-        devices : with those poses; the lenses keep their priors about their guesses. lenses : z of these.
+        posed : devices with those poses; the lenses keep their priors about their guesses. lenses : z of these.
         """
-        projector = devices[-1]
-        scale = baseline_mm / float(np.linalg.norm(projector.centre_mm - devices[0].centre_mm))
+        projector = posed[-1]
+        scale = baseline_mm / float(np.linalg.norm(projector.centre_mm - posed[0].centre_mm))
         largest = {index: max((p for at, p in self.blocks if at == index), key=len) for index, _ in self.blocks}
         before = []
-        for index, (guess, device) in enumerate(zip(self.before, devices, strict=True)):
+        for index, (guess, device) in enumerate(zip(self.before, posed, strict=True)):
             centre = device.centre_mm
-            if 0 < index < len(devices) - 1:
+            if 0 < index < len(posed) - 1:
                 # Equations of two devices leave the length of each baseline open: depths of both cameras agree.
-                ratio = _depth_ratio((devices[0], largest[0]), (device, largest[index]), projector)
+                ratio = _depth_ratio((posed[0], largest[0]), (device, largest[index]), projector)
                 centre = projector.centre_mm + ratio * (centre - projector.centre_mm)
             before.append(replace(guess, rotation=device.rotation, translation_mm=-device.rotation @ centre * scale))
         poses = np.zeros((DEVICE_PARAMETERS * len(before),) * 2)
@@ -357,8 +357,8 @@ class _Problem:
     def design_effect(self, solved: _Solved) -> float:
         """Variance of sums of residuals over parts of the images, over that of independent ones.
 
-        Residuals of neighbours are alike where a lens is not what its model says, or the code errs. A fit hides most of
-        it; three times what it leaves in 8 x 8 cells is taken for that of 3 x 3 parts.
+        Residuals of neighbours are alike where a lens does not follow its model, or the code errs. A fit hides most of
+        it; three times the rest in 8 x 8 cells is taken for that of 3 x 3 parts.
         """
         devices, effects = self.devices(solved.z), []
         for index, pairs in solved.blocks:
@@ -560,8 +560,8 @@ def similarity_rms(first: FloatArray, second: FloatArray, /) -> float:
 def _from_nothing(problem: _Problem, baseline_mm: float) -> tuple[_Problem, FloatArray]:
     """The problem about poses that the pairs give, which have no prior but the length of the first baseline.
 
-    Every camera is placed beside the projector from several starts: by the essential matrix (Nistér 2004), for several
-    shifts of the projector's lens.
+    The pose of every camera to the projector starts from the essential matrix (Nistér 2004), for several shifts of the
+    projector's lens.
     """
     best: list[tuple[float, float, _Problem, FloatArray]] = []
     height = problem.before[-1].size.height_px
@@ -570,20 +570,20 @@ def _from_nothing(problem: _Problem, baseline_mm: float) -> tuple[_Problem, Floa
         if poses is None:
             continue
         lenses = np.asarray(np.linalg.pinv(problem.root) @ _lens_change(problem, shift * height))
-        placed, start = problem.placed(poses, lenses, baseline_mm)
-        solved = placed.solve(_TRIAL_POINTS, start, _USUAL_EFFECT)
-        found = placed.devices(solved.z)
-        if placed.share_in_front(found) >= _MIN_IN_FRONT:
-            # Again about what was found, so that the directions without a prior are those of that pose.
-            best.append((solved.cost, solved.sigma, *problem.placed(found, solved.z[: problem.free], baseline_mm)))
+        trial, start = problem.at_poses(poses, lenses, baseline_mm)
+        solved = trial.solve(_TRIAL_POINTS, start, _USUAL_EFFECT)
+        found = trial.devices(solved.z)
+        if trial.share_in_front(found) >= _MIN_IN_FRONT:
+            # Once more, about the pose that was found: the directions without a prior are those of that pose.
+            best.append((solved.cost, solved.sigma, *problem.at_poses(found, solved.z[: problem.free], baseline_mm)))
     if not best:
         message = (
             "no pose of camera and projector explains the pixels that they share. The likeliest causes: camera and "
-            "projector look from one place, a picture is mirrored, or a focal length is far from its guess"
+            "projector have almost one position, a picture is mirrored, or a focal length is far from its guess"
         )
         raise SolveRefusedError(message)
-    _, _, placed, start = min(best, key=lambda each: (each[1] > 2 * min(one[1] for one in best), each[0]))
-    return placed, start
+    _, _, nearest, start = min(best, key=lambda each: (each[1] > 2 * min(one[1] for one in best), each[0]))
+    return nearest, start
 
 
 def _lens_change(problem: _Problem, shift_px: float) -> FloatArray:
@@ -615,15 +615,15 @@ def _start_poses(problem: _Problem, shift_px: float, baseline_mm: float) -> Sequ
         _, rotation, shift, _ = cv2.recoverPose(essential, here, there, np.eye(3), mask=mask)
         relative.append((rotation, shift.ravel()))
     rotation, direction = relative[0]
-    placed = [replace(problem.before[0], rotation=np.eye(3), translation_mm=np.zeros(3))]
+    posed = [replace(problem.before[0], rotation=np.eye(3), translation_mm=np.zeros(3))]
     pose = replace(shifted, rotation=rotation, translation_mm=direction * baseline_mm)
     for index, (turn, shift) in enumerate(relative[1:], 1):
-        # x_p = R₀ x₀ + t₀ = R x + t, with lengths of all baselines alike so far; see `_Problem.placed`.
-        placed.append(
+        # x_p = R₀ x₀ + t₀ = R x + t, with lengths of all baselines alike so far; see `_Problem.at_poses`.
+        posed.append(
             replace(problem.before[index], rotation=turn.T @ rotation,
                     translation_mm=turn.T @ (direction - shift) * baseline_mm)
         )  # fmt: skip
-    return [*placed, pose]
+    return [*posed, pose]
 
 
 def _depth_ratio(camera: tuple[Pinhole, PixelPairs], other: tuple[Pinhole, PixelPairs], projector: Pinhole) -> float:
@@ -640,15 +640,15 @@ def _depth_ratio(camera: tuple[Pinhole, PixelPairs], other: tuple[Pinhole, Pixel
     _, one, two = np.intersect1d(*places, return_indices=True)
     if len(one) < _MIN_SHARED:
         message = (
-            f"expected at least {_MIN_SHARED} places of the projected image that two cameras see, to know where "
-            f"they stand to each other, found {len(one)}; put something before the rig that both see, or scan with one"
+            f"expected at least {_MIN_SHARED} places of the projected image that two cameras see, to find their "
+            f"relative pose, found {len(one)}; put something before the rig that both see, or scan with one"
         )
         raise SolveRefusedError(message)
     return float(np.nanmedian(depths[0][one] / depths[1][two]))
 
 
-def _open_words(problem: _Problem, devices: Sequence[Pinhole], found: SelfCalibration, most: float) -> str:
-    """Why the pairs leave the shape open, and what to do."""
+def _explain_open_shape(problem: _Problem, devices: Sequence[Pinhole], found: SelfCalibration, most: float) -> str:
+    """Explain why the pairs leave the shape open, and what to do."""
     index, pairs = max(problem.blocks, key=lambda each: len(each[1]))
     points = triangulate(devices[index], devices[-1], pairs.thinned(_POINTS))
     points = points[np.isfinite(points).all(axis=1)]
@@ -663,7 +663,7 @@ def _open_words(problem: _Problem, devices: Sequence[Pinhole], found: SelfCalibr
         )
     if problem.thickness(devices) < _FLAT:
         return (
-            "the scene is flat, and a plane looks alike for many lenses and for two poses. Put something with depth "
+            "the scene is flat, and a plane fits many lenses and two poses. Put something with depth "
             "before the rig: a box with a corner towards it, or several things one behind the other"
         )
     lens = max(found.changes, key=lambda name: _focal_sigma(found, name))

@@ -81,10 +81,10 @@ class SineModel(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SinusoidResponse:
-    """How light follows the values of the pattern.
+    """Relation of light to the values of the pattern.
 
-    gamma : light is the value to this power; NaN if the frames cannot tell. blur_px : standard deviation of the blur of
-    both lenses, projector px. misfit : standard deviation of what the fit leaves beyond noise, of B. noise_share :
+    gamma : light is the value to this power; NaN if the frames do not determine it. blur_px : standard deviation of the
+    blur of both lenses, projector px. misfit : standard deviation of the residuals beyond noise, of B. noise_share :
     variance that it leaves over that of the noise model, where it leaves less than noise; 1 otherwise.
     """
 
@@ -164,7 +164,7 @@ class SinusoidMap(NamedTuple):
 
 
 class _Intervals(NamedTuple):
-    """Where each pixel may be, (H, W) float32 each, projector px: middle of an interval, half of its width, and how
+    """Interval of positions of each pixel, (H, W) float32 each, projector px: its middle, half of its width, and how
     much further than that positions are tried.
     """
 
@@ -248,7 +248,7 @@ def locate_sinusoids(frames: AxisFrames, noise: NoiseModel, code: CodeMap, exten
 
 
 def _intervals(frames: AxisFrames, code: CodeMap, extent_px: int) -> _Intervals:
-    """The whole projector, or what the code leaves of it: its cells, and half a period either way."""
+    """The whole projector, or the cells that the code leaves of it and half a period either way."""
     shape = code.refusal.shape
     if not len(frames.bits):
         whole = ((extent_px - 1) / 2, extent_px / 2, 0.0)
@@ -256,7 +256,7 @@ def _intervals(frames: AxisFrames, code: CodeMap, extent_px: int) -> _Intervals:
     cell_px, period_px = frames.gray.cell_px, finest_period_px(frames.sine_patterns)
     middle = np.float32(cell_px / 2) * (code.lowest + code.highest + 1).astype(np.float32)
     middle -= np.float32(frames.gray.offset_px + 0.5)
-    # Two cells are those beside the edge of a bit in doubt.
+    # Two cells are those on either side of the edge of a bit in doubt.
     half = np.float32(cell_px / 2) * np.maximum(code.highest - code.lowest, 1).astype(np.float32)
     return _Intervals(middle, half, np.broadcast_to(np.float32(period_px / 2), shape))
 
@@ -325,7 +325,7 @@ def _estimate_response(
     swing, contrast = _finest_swing(images, patterns), np.maximum(white - black, 1e-3)
 
     def disagreement(gamma: float) -> tuple[FloatArray, FloatArray, SinusoidResponse]:
-        """χ² of each pixel, and what it is per squared share of B."""
+        """χ² of each pixel, and χ² per squared share of B."""
         given = noise, where, refusal, extent_px, frames.clipped_at
         if frames.has_reference:
             unblurred = contrast * mean_light(gamma)[1]
@@ -335,7 +335,7 @@ def _estimate_response(
         response = SinusoidResponse(gamma, _blur_px(share, patterns, gamma, has_reference=frames.has_reference))
         found = _locate(images, patterns, response, *given)
         fitted = found.refusal == 0
-        # Positions that the other frames hardly tell apart agree with any γ.
+        # Positions that the other frames hardly distinguish agree with any γ.
         apart = np.sqrt(found.misfit + found.advantage) + np.sqrt(found.misfit)
         variance = noise.variance(found.level).astype(np.float64)
         squared = found.misfit.astype(np.float64)
@@ -621,7 +621,7 @@ def _contradiction(
     position: float, values: Any, model: Any, own: Any, information: Any, levels: Any, dark: float, growth: float,
     misfit: float,
 ) -> float:  # fmt: skip
-    """How far the other groups and single frames are from a position, in variances, to the first order of errors."""
+    """Distance of the other groups and single frames from a position, in variances, to the first order of errors."""
     cost = 0.0
     for b in range(1, len(own)):
         apart = position - own[b]
@@ -641,7 +641,7 @@ def _contradiction(
 
 
 def _decide_by_neighbours(found: _Found) -> None:
-    """Where two positions are about as good, choose the one that pixels nearby, with one alone, continue."""
+    """Of two positions about as good, choose the one that continues nearby pixels with a single one."""
     doubtful = np.isfinite(found.other)
     for _ in range(_PASSES):
         if not doubtful.any():

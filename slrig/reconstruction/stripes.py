@@ -823,8 +823,8 @@ def smoothing_shift_px(
 
 
 def sample_image(image: NDArray[Any], points_px: FloatArray) -> FloatArray:
-    """(n,) float64: an image at (x, y) points, interpolated between the four pixels around each; beyond the outermost
-    pixels it goes on as they are.
+    """(n,) float64: an image at (x, y) points, interpolated between the four pixels around each, extended beyond the
+    outermost pixels.
     """
     last = np.array(image.shape[1::-1]) - 1
     within = np.clip(points_px, 0, last)
@@ -841,12 +841,12 @@ def edge_skew_px(image: NDArray[np.float32], points: LinePoints, filter_px: floa
     along the normal; of edges that are far from others.
 
     With light that spreads with variance v and third moment m, and a filter of variance t, a crossing lies
-    m / 6 (v + t) before the centroid (Edgeworth's expansion); what the filter moves it by, per variance, gives m. The
-    slope gives v + t. NaN for an edge that has others beside it.
+    m / 6 (v + t) before the centroid (Edgeworth's expansion); its shift by the filter, per variance, gives m. The
+    slope gives v + t. NaN for an edge next to others.
     """
     slope, bend = _slope_and_bend(image, points, np.ones(len(points.points_px), np.bool_), filter_px)
     slope = np.where(np.abs(slope) < 1e-3, np.nan, slope)
-    # By itself is an edge with light and dark on its sides: 3 of its deviations, by its slope, away.
+    # An edge alone has light and dark on its sides: 3 of its deviations, by its slope, away.
     away = points.normals * (3 * np.sqrt(2 / np.pi) / slope)[:, None]
     sides = [sample_image(image, np.nan_to_num(points.points_px + each)) for each in (away, -away)]
     alone = (sides[0] > _MIN_SIDE) & (sides[1] < -_MIN_SIDE)

@@ -438,17 +438,17 @@ def triangulate_camera_pairs(
     bridge separates. The two rays then meet in the least-squares sense. Curves run by the rows of `camera`, or by its
     columns if the stripes run rather across the image than down.
 
-    A point is met with the camera that most points meet for their standard deviation, or else with the next: the mean
-    of two would share the error of its own pixel. Also returns (m,) int32: index of the other camera of each point; and
-    (n,) bool: points of the ensemble that have a partner.
+    A point is matched with the camera that matches most points for their standard deviation, or else with the next: the
+    mean of two would share the error of its own pixel. Also returns (m,) int32: index of the other camera of each
+    point; and (n,) bool: points of the ensemble that have a partner.
     """
-    met = [_met(first, second, camera, other) for second, other in others]
+    met = [_match_curves(first, second, camera, other) for second, other in others]
     partner = np.full(len(first.points_px), -1, dtype=np.int32)
     points, deviation = (np.full((len(partner), 3), np.nan) for _ in range(2))
     for index in sorted(range(len(met)), key=lambda index: -_worth(*met[index][1:])):
         points_mm, deviation_mm, valid = met[index]
         new = valid & (partner < 0)
-        new &= _met_back(points_mm, new, first, camera, *others[index])
+        new &= _is_matched_back(points_mm, new, first, camera, *others[index])
         points[new], deviation[new], partner[new] = points_mm[new], deviation_mm[new], index
     curves = SheetCurves(
         offsets=first.offsets,
@@ -473,18 +473,18 @@ def _worth(deviation_mm: FloatArray, valid: NDArray[np.bool_]) -> float:
     )
 
 
-def _met_back(
+def _is_matched_back(
     points_mm: FloatArray, new: NDArray[np.bool_], first: StripeEnsemble, camera: Pinhole, second: StripeEnsemble,
     other: Pinhole,
 ) -> NDArray[np.bool_]:  # fmt: skip
-    """(n,) bool: points that the other camera finds again when its own are met with the first's.
+    """(n,) bool: points that the other camera finds again when its own are matched with the first's.
 
-    What the other camera does not see may meet the part of the stripe that it sees on another surface.
+    A point hidden from the other camera may match a part of the stripe on another surface.
     """
     # Half a second to load, and few scans need it.
     from scipy.spatial import cKDTree
 
-    back_mm, _, valid = _met(second, first, other, camera)
+    back_mm, _, valid = _match_curves(second, first, other, camera)
     found = np.zeros(len(points_mm), dtype=np.bool_)
     if valid.any() and new.any():
         back_mm = back_mm[valid]
@@ -494,10 +494,10 @@ def _met_back(
     return found
 
 
-def _met(
+def _match_curves(
     first: StripeEnsemble, second: StripeEnsemble, camera: Pinhole, other: Pinhole
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """(n, 3) points of `first`, (n, 3) displacement for one standard deviation, and (n,) bool: where there is any."""
+    """(n, 3) points of `first`, (n, 3) displacement for one standard deviation, and (n,) bool: True where matched."""
     shared, own_index, other_index = np.intersect1d(first.position_px, second.position_px, return_indices=True)
     del shared
     partner = np.full(len(first.position_px), -1, dtype=np.int32)

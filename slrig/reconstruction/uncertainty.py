@@ -10,7 +10,7 @@ The σ of a vertex consists of, added in squares:
 3. both moved through the triangulation, which gives millimetres (`triangulation`, fused by `merging`), and projected
    onto the normal (`sigma_along_normal`);
 4. the calibration's covariance, if it states one (`calibration_sigma`);
-5. what cameras show beyond what is stated (`redundancy`), and the covariance of a pose refined from them
+5. the disagreement of cameras beyond the stated σ (`redundancy`), and the covariance of a pose refined from them
    (`pose_refinement`).
 
 `slrig.scan.reconstruct` adds 3 to 5.

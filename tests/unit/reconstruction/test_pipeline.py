@@ -303,7 +303,7 @@ def test_stripes_are_located_before_the_bits_come_that_only_number_them(
 def test_missing_frames_are_listed() -> None:
     capture = rendered(slope, patterns())
     count = len(used_shots(capture, "eye"))
-    with pytest.raises(PatternError, match=r"1 of the frames announced did not come: LineShift\(.*shift=7"):
+    with pytest.raises(PatternError, match=r"1 of the frames announced are missing: LineShift\(.*shift=7"):
         streamed(capture, range(count - 1))
 
 

@@ -241,7 +241,7 @@ def test_derivatives_are_those_of_differences() -> None:
     pairs, _ = shared(truth, surface("relief", chance, 600), chance)
     calibration = Calibration({"left": pinhole(CAMERA, truth.camera)}, pinhole(PROJECTOR, truth.projector))
     sigma = np.tile([3.0] * 4 + [0.01] * 5 + [0.05] * 3 + [1.0] * 3, 2)
-    problem = _Problem.of(calibration, np.diag(sigma**2), [{"left": PixelPairs(
+    problem = _Problem.build(calibration, np.diag(sigma**2), [{"left": PixelPairs(
         np.tile(pairs.camera_px, (3, 1)), np.tile(pairs.projector_px, (3, 1)), np.tile(pairs.sigma_px, 3), pairs.axis
     )}])  # fmt: skip
     z = 3 * chance.normal(size=problem.free)
