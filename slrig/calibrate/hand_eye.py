@@ -134,7 +134,7 @@ def hand_eye_document(
         ],
         left_out={**(refused or {}), **found.left_out}, remarks=list(found.remarks),
         next_pose=None if move is None
-        else NextPose(words=move.words, flange=move.flange.tolist(), sigma_mm=move.sigma_mm),
+        else NextPose(words=move.text, flange=move.flange.tolist(), sigma_mm=move.sigma_mm),
     )  # fmt: skip
 
 

@@ -173,7 +173,7 @@ class Board:
 
     @property
     def measured(self) -> bool:
-        """Whether its size was measured, and is not what was printed by some printer."""
+        """True if its size was measured, False if it is that of the print file."""
         return self.square_sigma != PRINT_SIGMA or self.aspect != 1
 
     @property

@@ -1,4 +1,4 @@
-"""Where a rig stands in a robot's frames: hand-eye calibration by poses of a board, or positions of a sphere.
+"""Hand-eye calibration: the pose of a rig in a robot's frames, by poses of a board or positions of a sphere.
 
 X is the rig in the flange (in hand) or in the base (fixed), Z the target in the base or in the flange, T the flange in
 the base, B the target in the rig. Every pose should give
@@ -32,7 +32,7 @@ from slrig.errors import CalibrationError, SolveRefusedError
 from slrig.model import FloatArray
 
 EulerOrder = Literal["xyz", "zyx", "zyz", "zxz", "XYZ", "ZYX", "ZYZ", "ZXZ"]
-"""Of three angles, as scipy has it: about fixed axes (small letters), or about axes that turn along."""
+"""Order of three angles, as in scipy: about fixed axes (small letters), or about axes that turn along."""
 
 MIN_POSES = 4
 USUAL_NOISE = (0.1, 0.02)
@@ -44,11 +44,11 @@ _REGULAR = 1e-10
 _MAX_STEP_RAD = 0.5
 _MAX_REACH_MM = 1e5  # of a robot on rails, far less of others
 _MIN_TURN_DEG = 1.0
-"""Least turn about a second axis, rms: less does not tell where the rig is along the first one."""
+"""Least turn about a second axis, rms: less does not determine the rig's position along the first one."""
 _MAX_SIGMA_MM, _MAX_SIGMA_DEG = 5.0, 1.0
 """With the usual noise; beyond, the motion leaves something undetermined."""
 _POOR_MM, _POOR_DEG = 1.0, 0.2
-"""Noise of a robot beyond which a cause in the input is looked for."""
+"""Noise of a robot beyond which a cause in the input is searched."""
 _REFUSED_MM, _REFUSED_DEG = 5.0, 1.0
 _MUCH_BETTER = 5.0  # times less rms that another reading of the poses must have
 _KEPT = 0.75
@@ -59,7 +59,7 @@ _SCALE_SIGMAS = 4.0
 
 
 class HandEyeKind(StrEnum):
-    """in-hand : the rig is on the flange, the target stands still. fixed : the robot holds the target."""
+    """in-hand : the rig is on the flange, the target does not move. fixed : the robot holds the target."""
 
     IN_HAND = "in-hand"
     FIXED = "fixed"
@@ -71,22 +71,22 @@ class HandEyeKind(StrEnum):
 
     @property
     def frame(self) -> str:
-        """What the rig's place is given in."""
+        """Frame of the rig's pose."""
         return "flange" if self is HandEyeKind.IN_HAND else "base"
 
-    def moved(self, flange: FloatArray) -> FloatArray:
+    def motion(self, flange: FloatArray) -> FloatArray:
         """G of the equation above, (…, 4, 4), of poses of the flange."""
         return np.asarray(np.linalg.inv(flange) if self is HandEyeKind.IN_HAND else flange)
 
 
 @dataclass(frozen=True, slots=True)
 class RobotPoses:
-    """Poses of a robot's flange in its base, as its controller tells them.
+    """Poses of a robot's flange in its base, as its controller reports them.
 
     names : of the n poses; poses : (n, 4, 4) float64, mm. euler : order of the angles that they were read from;
     None if they were read from something else.
 
-    Raises CalibrationError if one is no rigid motion.
+    Raises CalibrationError if one is not a rigid motion.
     """
 
     names: tuple[str, ...]
@@ -117,7 +117,7 @@ class RobotPoses:
 
 @dataclass(frozen=True, slots=True)
 class TargetPoses:
-    """What the rig saw in n poses. poses : (n, 4, 4) float64, target to rig, mm; of a sphere its centre alone counts.
+    """Poses of the target in the rig. poses : (n, 4, 4) float64, target to rig, mm; of a sphere only the centre.
 
     covariance : (6 n, 6 n) float64 of a board, (3 n, 3 n) of a sphere's centres.
     """
@@ -140,11 +140,11 @@ class TargetPoses:
 
 
 class NextMove(NamedTuple):
-    """A pose of the flange that would tell most. sigma_mm : worst standard deviation of the rig's place then."""
+    """The most informative next pose of the flange. sigma_mm : worst standard deviation of the rig's position then."""
 
     flange: FloatArray
     sigma_mm: float
-    words: str
+    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +152,7 @@ class HandEye:
     """A solved hand-eye calibration.
 
     rig : (4, 4) float64, rig to flange (in hand) or to base (fixed). target : (4, 4) float64, target to base (in hand)
-    or to flange (fixed); of a sphere its rotation means nothing. covariance : (12, 12) float64 of both, (9, 9) with a
+    or to flange (fixed); of a sphere its rotation is meaningless. covariance : (12, 12) float64 of both, (9, 9) with a
     sphere. robot_sigma : of each coordinate, mm, and of each turn, degrees; estimated : whether from the residuals.
     names, residual_mm, residual_deg : of the poses that count: distance and turn of the target from where it should
     be, NaN degrees of a sphere. left_out : poses that contradict the others, with reasons.
@@ -185,7 +185,7 @@ class HandEye:
 
 
 class Drift(NamedTuple):
-    """New poses held against a calibration: the rig's move since then if nothing else moved, its deviation, and the
+    """New poses compared with a calibration: the rig's move since then if nothing else moved, its deviation, and the
     chance of residuals as large without any. residual_mm, residual_deg : by pose.
     """
 
@@ -199,22 +199,22 @@ class Drift(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether the residuals are within what is stated."""
+        """True if the residuals are within the stated deviations."""
         return self.probability > _RARE
 
 
 class _Problem(NamedTuple):
     robot: RobotPoses
-    seen: TargetPoses
+    views: TargetPoses
     kind: HandEyeKind
 
     def select(self, chosen: NDArray[np.intp]) -> _Problem:
-        return _Problem(self.robot.select(chosen), self.seen.select(chosen), self.kind)
+        return _Problem(self.robot.select(chosen), self.views.select(chosen), self.kind)
 
 
 class _Fit(NamedTuple):
-    """squares : of all residuals, weighted; by_pose : of each, against what the others predict. scale : by how much the
-    rig's distances are longer than the robot's moves, over themselves, and the deviation.
+    """squares : of all residuals, weighted; by_pose : of each, against the prediction of the others. scale : by how
+    much the rig's distances are longer than the robot's moves, over themselves, and the deviation.
     """
 
     rig: FloatArray
@@ -242,7 +242,7 @@ class _Fit(NamedTuple):
 
 
 def solve_hand_eye(
-    robot: RobotPoses, seen: TargetPoses, kind: HandEyeKind, /, *, robot_sigma: tuple[float, float] | None = None
+    robot: RobotPoses, views: TargetPoses, kind: HandEyeKind, /, *, robot_sigma: tuple[float, float] | None = None
 ) -> HandEye:
     """Solve for rig and target by poses of robot and target in the same order.
 
@@ -254,13 +254,13 @@ def solve_hand_eye(
     if robot_sigma is not None and not all(each > 0 for each in robot_sigma):
         message = f"the robot's noise: expected mm and degrees above 0, found {robot_sigma[0]:g} and {robot_sigma[1]:g}"
         raise CalibrationError(message)
-    if not len(robot.names) == len(seen.names) >= MIN_POSES:
+    if not len(robot.names) == len(views.names) >= MIN_POSES:
         message = (
             f"expected {MIN_POSES} poses or more, each of robot and target, found {len(robot.names)} and "
-            f"{len(seen.names)}; 12 that turn by 30° about two axes are good"
+            f"{len(views.names)}; 12 that turn by 30° about two axes are good"
         )
         raise SolveRefusedError(message)
-    problem = whole = _Problem(robot, seen, kind)
+    problem = whole = _Problem(robot, views, kind)
     _require_turns(problem)
     left_out: dict[str, str] = {}
     fit = _fit(problem, robot_sigma)
@@ -270,7 +270,7 @@ def solve_hand_eye(
             break
         rest = problem.select(np.delete(np.arange(len(problem.robot.names)), worst))
         without = _fit(rest, robot_sigma)
-        mm, degrees = _sizes(_linearise(without.rig, without.target, problem)[0], seen.terms)
+        mm, degrees = _sizes(_linearise(without.rig, without.target, problem)[0], views.terms)
         turned = "" if np.isnan(degrees[worst]) else f" and {degrees[worst]:.2g}°"
         left_out[problem.robot.names[worst]] = (
             f"contradicts the other poses by {mm[worst]:.2g} mm{turned}: most likely the robot still moved when its "
@@ -294,34 +294,34 @@ def solve_hand_eye(
     return replace(found, next_move=_next_move(found, problem))
 
 
-def check_hand_eye(found: HandEye, robot: RobotPoses, seen: TargetPoses, /) -> Drift:
-    """Hold new poses of the same target, at its place of then, against a hand-eye calibration.
+def check_hand_eye(found: HandEye, robot: RobotPoses, views: TargetPoses, /) -> Drift:
+    """Compare new poses of the same target, at its earlier place, with a hand-eye calibration.
 
     Raises CalibrationError if it is another kind of target.
     """
-    if len(found.covariance) != 6 + seen.terms:
-        kinds = ("a sphere", "a board") if seen.terms == 6 else ("a board", "a sphere")
+    if len(found.covariance) != 6 + views.terms:
+        kinds = ("a sphere", "a board") if views.terms == 6 else ("a board", "a sphere")
         message = (
             f"the hand-eye calibration is by {kinds[0]}, and these poses are of {kinds[1]}: show it the same target"
         )
         raise CalibrationError(message)
-    residual, slopes, by_robot = _linearise(found.rig, found.target, _Problem(robot, seen, found.kind))
-    own = _residual_covariance(seen, by_robot, found.robot_sigma)
+    residual, slopes, by_robot = _linearise(found.rig, found.target, _Problem(robot, views, found.kind))
+    own = _residual_covariance(views, by_robot, found.robot_sigma)
     total = own + slopes @ found.covariance @ slopes.T
     weighted = np.linalg.solve(own, slopes[:, :6])
-    # A sphere in one or two poses leaves some moves open: the least of those that explain it is told.
+    # A sphere in one or two poses leaves some moves open: the least of those that explain it is returned.
     gain = np.linalg.pinv(weighted.T @ slopes[:, :6], rtol=1e-9, hermitian=True) @ weighted.T
     move, sigma = gain @ residual, np.sqrt(np.diagonal(gain @ total @ gain.T))
     return Drift(
         float(np.linalg.norm(move[3:])), float(np.degrees(np.linalg.norm(move[:3]))),
         float(np.linalg.norm(sigma[3:])), float(np.degrees(np.linalg.norm(sigma[:3]))),
         _chance(found, float(residual @ np.linalg.solve(total, residual)), len(residual)),
-        *_sizes(residual, seen.terms),
+        *_sizes(residual, views.terms),
     )  # fmt: skip
 
 
 def _chance(found: HandEye, squares: float, count: int) -> float:
-    """The chance of as large a sum of squares of `count` residuals, whose deviations may be estimates themselves."""
+    """Chance of so large a sum of squares of `count` residuals, whose deviations may be estimates themselves."""
     terms = len(found.covariance) - 6
     freedom = terms * len(found.names) - len(found.covariance)
     return float(f.sf(squares / count, count, freedom) if found.estimated else chi2.sf(squares, count))
@@ -346,11 +346,11 @@ def _inverse_change(pose: FloatArray) -> FloatArray:
 
 
 def _linearise(rig: FloatArray, target: FloatArray, problem: _Problem) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Residuals, measured minus predicted, (n k,); derivatives of what is predicted by rig and target, (n k, 6 + k);
+    """Residuals, measured minus predicted, (n k,); derivatives of the prediction by rig and target, (n k, 6 + k);
     and by the robot's poses, (n, k, 6).
     """
-    robot, seen, kind = problem
-    moved = kind.moved(robot.poses)
+    robot, views, kind = problem
+    moved = kind.motion(robot.poses)
     predicted = np.linalg.inv(rig) @ moved @ target
     back, turned = np.broadcast_to(rig[:3, :3].T, (len(moved), 3, 3)), moved[:, :3, :3]
     lever = turned @ target[:3, 3]
@@ -359,12 +359,12 @@ def _linearise(rig: FloatArray, target: FloatArray, problem: _Problem) -> tuple[
     by_robot = _blocks(back, -back @ _skew(lever))
     if kind is HandEyeKind.IN_HAND:
         by_robot = by_robot @ _inverse_change(robot.poses)
-    turn = Rotation.from_matrix(seen.poses[:, :3, :3] @ np.swapaxes(predicted[:, :3, :3], 1, 2)).as_rotvec()
-    residual = np.hstack([turn, seen.poses[:, :3, 3] - predicted[:, :3, 3]])
-    # A sphere's centre has a place alone, and no turn.
-    first = 6 - seen.terms
+    turn = Rotation.from_matrix(views.poses[:, :3, :3] @ np.swapaxes(predicted[:, :3, :3], 1, 2)).as_rotvec()
+    residual = np.hstack([turn, views.poses[:, :3, 3] - predicted[:, :3, 3]])
+    # A sphere's centre has a position, but no orientation.
+    first = 6 - views.terms
     slopes = np.concatenate([by_rig[:, first:], by_target[:, first:, first:]], axis=2)
-    return residual[:, first:].ravel(), slopes.reshape(-1, 6 + seen.terms), by_robot[:, first:]
+    return residual[:, first:].ravel(), slopes.reshape(-1, 6 + views.terms), by_robot[:, first:]
 
 
 def _robot_covariance(by_robot: FloatArray, noise: tuple[float, float]) -> FloatArray:
@@ -373,47 +373,47 @@ def _robot_covariance(by_robot: FloatArray, noise: tuple[float, float]) -> Float
     return np.asarray(block_diag(*(scaled @ np.swapaxes(scaled, 1, 2))))
 
 
-def _residual_covariance(seen: TargetPoses, by_robot: FloatArray, noise: tuple[float, float]) -> FloatArray:
-    return _regular(seen.covariance + _robot_covariance(by_robot, noise))
+def _residual_covariance(views: TargetPoses, by_robot: FloatArray, noise: tuple[float, float]) -> FloatArray:
+    return _regular(views.covariance + _robot_covariance(by_robot, noise))
 
 
 def _regular(covariance: FloatArray) -> FloatArray:
-    """With a little more on its diagonal, so that it can be inverted wherever poses that do not fit lead a solve."""
+    """Increase the diagonal a little, to allow inversion wherever poses that do not fit lead a solve."""
     return covariance + _REGULAR * np.diag(np.diagonal(covariance))
 
 
-def _applied(pose: FloatArray, step: FloatArray) -> FloatArray:
+def _apply_step(pose: FloatArray, step: FloatArray) -> FloatArray:
     moved = pose.copy()
     moved[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix() @ pose[:3, :3]
     moved[:3, 3] += step[3:]
     return moved
 
 
-def _solved(
+def _iterate(
     rig: FloatArray, target: FloatArray, problem: _Problem, noise: tuple[float, float], *, steps: int = _STEPS
 ) -> tuple[FloatArray, FloatArray, float]:
     """Rig, target and sum of squares, from a start; steps of Gauss and Newton."""
     squares = np.inf
     for _ in range(steps):
         residual, slopes, by_robot = _linearise(rig, target, problem)
-        weighted = cho_factor(_residual_covariance(problem.seen, by_robot, noise))
+        weighted = cho_factor(_residual_covariance(problem.views, by_robot, noise))
         pull = slopes.T @ cho_solve(weighted, np.column_stack([slopes, residual]))
         squares = float(residual @ cho_solve(weighted, residual))
         sigma = 1 / np.sqrt(np.diagonal(pull) + 1e-300)
         step = sigma * np.linalg.lstsq(pull[:, :-1] * np.outer(sigma, sigma), sigma * pull[:, -1], rcond=_DETERMINED)[0]
         sizes = np.abs(step[:3]).max() / _MAX_STEP_RAD, np.abs(step[3:]).max() / _MAX_REACH_MM
         step /= max(1.0, *sizes)
-        rig = _applied(rig, step[:6])
-        target = _applied(target, np.concatenate([np.zeros(6 - problem.seen.terms), step[6:]]))
+        rig = _apply_step(rig, step[:6])
+        target = _apply_step(target, np.concatenate([np.zeros(6 - problem.views.terms), step[6:]]))
         if np.abs(step / sigma).max() < _SETTLED:
             break
     return rig, target, squares
 
 
 def _posterior(rig: FloatArray, target: FloatArray, problem: _Problem, noise: tuple[float, float]) -> FloatArray:
-    """Covariance of rig and target; what is not determined has a very large one."""
+    """Covariance of rig and target, very large along undetermined directions."""
     _, slopes, by_robot = _linearise(rig, target, problem)
-    weights = np.linalg.inv(_residual_covariance(problem.seen, by_robot, noise))
+    weights = np.linalg.inv(_residual_covariance(problem.views, by_robot, noise))
     information = slopes.T @ weights @ slopes
     scale = 1 / np.sqrt(np.diagonal(information) + 1e-300)
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
@@ -423,26 +423,26 @@ def _posterior(rig: FloatArray, target: FloatArray, problem: _Problem, noise: tu
 
 def _start(problem: _Problem) -> tuple[FloatArray, FloatArray]:
     """Rough rig and target."""
-    robot, seen, kind = problem
-    moved = kind.moved(robot.poses)
+    robot, views, kind = problem
+    moved = kind.motion(robot.poses)
     turns = moved[:, :3, :3]
     system = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), -turns], axis=2).reshape(-1, 6)
 
-    def placed(rig_turn: FloatArray, target_turn: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def with_shifts(rig_turn: FloatArray, target_turn: FloatArray) -> tuple[FloatArray, FloatArray]:
         # R_X t_B + t_X = R_G t_Z + t_G is linear in t_X and t_Z.
-        aim = moved[:, :3, 3] - seen.poses[:, :3, 3] @ rig_turn.T
+        aim = moved[:, :3, 3] - views.poses[:, :3, 3] @ rig_turn.T
         poses = np.tile(np.eye(4), (2, 1, 1))
         poses[:, :3, :3] = rig_turn, target_turn
         poses[:, :3, 3] = np.linalg.lstsq(system, aim.ravel(), rcond=1e-9)[0].reshape(2, 3)
         return poses[0], poses[1]
 
-    if seen.terms == 6:
+    if views.terms == 6:
         # Shah 2013: the sum of G ⊗ B has the rotations of rig and target as its first singular vectors.
-        kron = np.einsum("nij,nkl->ikjl", turns, seen.poses[:, :3, :3]).reshape(9, 9)
+        kron = np.einsum("nij,nkl->ikjl", turns, views.poses[:, :3, :3]).reshape(9, 9)
         left, _, right = np.linalg.svd(kron)
-        return placed(_nearest_rotation(left[:, 0].reshape(3, 3)), _nearest_rotation(right[0].reshape(3, 3)))
+        return with_shifts(_nearest_rotation(left[:, 0].reshape(3, 3)), _nearest_rotation(right[0].reshape(3, 3)))
     starts = Rotation.create_group("O").as_matrix()
-    tried = [_solved(*placed(turn, np.eye(3)), problem, USUAL_NOISE, steps=8) for turn in starts]
+    tried = [_iterate(*with_shifts(turn, np.eye(3)), problem, USUAL_NOISE, steps=8) for turn in starts]
     rig, target, _ = min(tried, key=lambda each: each[2])
     return rig, target
 
@@ -456,43 +456,43 @@ def _fit(problem: _Problem, stated: tuple[float, float] | None) -> _Fit:
     rig, target = _start(problem)
     noise = stated or USUAL_NOISE
     for _ in range(_ROUNDS):
-        rig, target, _ = _solved(rig, target, problem, noise)
-        before, noise = noise, stated or _estimated_noise(rig, target, problem, noise)
+        rig, target, _ = _iterate(rig, target, problem, noise)
+        before, noise = noise, stated or _estimate_noise(rig, target, problem, noise)
         if np.allclose(before, noise, rtol=0.01):
             break
     residual, slopes, by_robot = _linearise(rig, target, problem)
-    weights = np.linalg.inv(_residual_covariance(problem.seen, by_robot, noise))
+    weights = np.linalg.inv(_residual_covariance(problem.views, by_robot, noise))
     covariance = _posterior(rig, target, problem, noise)
     # Each pose against the one that all others predict, by the inverse of the partitioned covariance.
     left = weights - weights @ slopes @ covariance @ slopes.T @ weights
-    pulled, terms = left @ residual, problem.seen.terms
+    pulled, terms = left @ residual, problem.views.terms
     rows = np.arange(len(residual)).reshape(-1, terms)
     by_pose = [pulled[own] @ np.linalg.pinv(left[np.ix_(own, own)], hermitian=True) @ pulled[own] for own in rows]
     longer = np.zeros((len(rows), terms))
-    longer[:, -3:] = problem.seen.poses[:, :3, 3]
+    longer[:, -3:] = problem.views.poses[:, :3, 3]
     weight = longer.ravel() @ left @ longer.ravel()
     scale = float(longer.ravel() @ pulled / weight), float(1 / np.sqrt(weight))
     return _Fit(rig, target, covariance, noise, residual, float(residual @ pulled), np.array(by_pose), terms, scale)
 
 
-def _estimated_noise(
+def _estimate_noise(
     rig: FloatArray, target: FloatArray, problem: _Problem, start: tuple[float, float]
 ) -> tuple[float, float]:
-    """The robot's noise, mm and degrees; by a sphere, which tells no turns, in the ratio of the usual noise."""
+    """The robot's noise, mm and degrees; by a sphere, which shows no turns, in the ratio of the usual noise."""
     residual, slopes, by_robot = _linearise(rig, target, problem)
     place, turn = _robot_covariance(by_robot, (1.0, 0.0)), _robot_covariance(by_robot, (0.0, 1.0))
-    told = [0, 1] if problem.seen.terms == 6 else [0, 0]
+    measured = [0, 1] if problem.views.terms == 6 else [0, 0]
 
     def cost(logarithms: FloatArray) -> float:
-        mm, degrees = (np.exp(logarithms[told]) * USUAL_NOISE) ** 2
-        factor = cho_factor(_regular(problem.seen.covariance + mm * place + degrees * turn))
+        mm, degrees = (np.exp(logarithms[measured]) * USUAL_NOISE) ** 2
+        factor = cho_factor(_regular(problem.views.covariance + mm * place + degrees * turn))
         weighted = cho_solve(factor, np.column_stack([slopes, residual]))
         information, pull = slopes.T @ weighted[:, :-1], slopes.T @ weighted[:, -1]
         left = residual @ weighted[:, -1] - pull @ np.linalg.lstsq(information, pull, rcond=1e-13)[0]
         return float(2 * np.log(np.diagonal(factor[0])).sum() + np.linalg.slogdet(information)[1] + left)
 
     found = minimize(cost, np.log(np.array(start) / USUAL_NOISE), method="L-BFGS-B", bounds=[(-6.0, 9.0)] * 2)
-    mm, degrees = (np.exp(found.x[told]) * USUAL_NOISE).tolist()
+    mm, degrees = (np.exp(found.x[measured]) * USUAL_NOISE).tolist()
     return mm, degrees
 
 
@@ -520,11 +520,11 @@ def _require_turns(problem: _Problem) -> None:
     in_hand = problem.kind is HandEyeKind.IN_HAND
     _, sizes, axes = _turns(problem.robot.poses, own_axes=in_hand)
     frame, advice = problem.kind.frame, f"turn the flange by {_NEXT_TURN_DEG:g}° or more"
-    seen_deg = _turns(problem.seen.poses, own_axes=False)[1][0] if problem.seen.terms == 6 else 0.0
-    if seen_deg > 5 * max(sizes[0], _MIN_TURN_DEG):
+    board_deg = _turns(problem.views.poses, own_axes=False)[1][0] if problem.views.terms == 6 else 0.0
+    if board_deg > 5 * max(sizes[0], _MIN_TURN_DEG):
         message = (
-            f"the robot's poses turn by {sizes[0]:.2g}° (rms), and the board was seen to turn by {seen_deg:.2g}°: are "
-            "their angles in radians and read as degrees, or are they of other moments?"
+            f"the robot's poses turn by {sizes[0]:.2g}° (rms), and the board turns by {board_deg:.2g}°: are their "
+            "angles in radians and read as degrees, or are they of other moments?"
         )
         raise SolveRefusedError(message)
     if sizes[0] < _MIN_TURN_DEG:
@@ -544,8 +544,8 @@ def _require_turns(problem: _Problem) -> None:
 
 
 def _turns(poses: FloatArray, *, own_axes: bool) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Singular vectors and values, degrees (rms), of the turns of poses from their mean, about the axes of what is
-    posed or of what it is posed in.
+    """Singular vectors and values, degrees (rms), of the turns of poses from their mean, about their own axes, or
+    about those of the frame that they are in.
     """
     turns = Rotation.from_matrix(poses[:, :3, :3])
     middle = turns.mean()
@@ -560,7 +560,7 @@ def _direction(vector: FloatArray) -> str:
 
 
 def _require_determined(covariance: FloatArray, kind: HandEyeKind) -> None:
-    """Refuse what the usual noise would leave open, and name it by its direction."""
+    """Refuse poses that leave a direction open at the usual noise, and name that direction."""
     for own, unit, limit, name, what, remedy in (
         (slice(0, 3), 180 / np.pi, _MAX_SIGMA_DEG, "°", "turn about", "at places of the view that lie farther apart"),
         (slice(3, 6), 1.0, _MAX_SIGMA_MM, " mm", "place along", "turned by 30° more about two axes"),
@@ -577,24 +577,24 @@ def _require_determined(covariance: FloatArray, kind: HandEyeKind) -> None:
 
 
 def _readings(problem: _Problem) -> Iterator[tuple[str, _Problem]]:
-    """Other readings of the same numbers, each with its words."""
-    robot, seen, kind = problem
+    """Other readings of the same numbers, each with its description."""
+    robot, views, kind = problem
     count, turns = len(robot.names), Rotation.from_matrix(robot.poses[:, :3, :3])
 
-    def turned(words: str, other: Rotation) -> tuple[str, _Problem]:
+    def turned(text: str, other: Rotation) -> tuple[str, _Problem]:
         poses = robot.poses.copy()
         poses[:, :3, :3] = other.as_matrix()
-        return words, _Problem(replace(robot, poses=poses), seen, kind)
+        return text, _Problem(replace(robot, poses=poses), views, kind)
 
     yield (
         f"the rig is {kind.other} and not {kind}, or these are poses of the base in the flange, to be inverted",
-        _Problem(robot, seen, kind.other),
+        _Problem(robot, views, kind.other),
     )
     for unit, factor in (("m", 1000.0), ("cm", 10.0), ("inch", 25.4)):
         scaled = robot.poses * np.array([1.0, 1.0, 1.0, factor]) ** [[1], [1], [1], [0]]
         if np.abs(scaled[:, :3, 3]).max() < _MAX_REACH_MM:
-            words = f"the robot's positions are in {unit}, and not in mm"
-            yield words, _Problem(replace(robot, poses=scaled), seen, kind)
+            text = f"the robot's positions are in {unit}, and not in mm"
+            yield text, _Problem(replace(robot, poses=scaled), views, kind)
     for order, roll in (("w, x, y, z", -1), ("x, y, z, w", 1)):
         quaternions = Rotation.from_quat(np.roll(turns.as_quat(), roll, axis=1))
         yield turned(f"the quaternions are in the order {order}, and not as stated", quaternions)
@@ -602,11 +602,11 @@ def _readings(problem: _Problem) -> Iterator[tuple[str, _Problem]]:
     for order in get_args(EulerOrder) if robot.euler else ():
         angles = turns.as_euler(robot.euler or order)
         yield turned(f"the angles are in the order {order}, and not {robot.euler}", Rotation.from_euler(order, angles))
-    for words, first, last in (("before", 1, 0), ("after", 0, 1)):
+    for side, first, last in (("before", 1, 0), ("after", 0, 1)):
         listed, pictured = np.arange(last, count - first), np.arange(first, count - last)
         yield (
-            f"pictures and poses are out of step: each picture belongs to the pose listed {words} it",
-            _Problem(robot.select(listed), seen.select(pictured), kind),
+            f"pictures and poses are out of step: each picture belongs to the pose listed {side} it",
+            _Problem(robot.select(listed), views.select(pictured), kind),
         )
 
 
@@ -618,20 +618,20 @@ def _require_fit(fit: _Fit, problem: _Problem) -> None:
     refusal = f"the poses of robot and target do not fit, by {mm:.2g} mm" + (
         "" if np.isnan(degrees) else f" and {degrees:.2g}°"
     )
-    for words, other in _readings(problem):
+    for text, other in _readings(problem):
         better = _fit(other, USUAL_NOISE).rms if len(other.robot.names) >= MIN_POSES else fit.rms
         if better[0] < min(_POOR_MM, mm / _MUCH_BETTER):
-            raise SolveRefusedError(f"{refusal} (rms). They do, to {better[0]:.2g} mm, if {words}")
+            raise SolveRefusedError(f"{refusal} (rms). They do, to {better[0]:.2g} mm, if {text}")
     if mm > _REFUSED_MM or degrees > _REFUSED_DEG:
         message = (
-            f"{refusal} (rms), in no other order or unit. Is each picture of the robot's pose beside it, is the target "
-            "fixed, and is the board's square as measured?"
+            f"{refusal} (rms), in no other order or unit. Is each picture of the robot's pose next to it, is the "
+            "target fixed, and is the board's square as measured?"
         )
         raise SolveRefusedError(message)
 
 
 def _stated_covariance(fit: _Fit, stated: tuple[float, float] | None) -> tuple[FloatArray, tuple[str, ...]]:
-    """The covariance that is told, and remarks: wider where the noise was estimated, or is larger than stated."""
+    """The covariance to state, and remarks: wider where the noise was estimated, or is larger than stated."""
     if stated is None:
         # So that one standard deviation holds 68 %, as of a normal distribution.
         return fit.covariance * float(t.ppf(0.8413, fit.freedom)) ** 2, ()
@@ -646,14 +646,14 @@ def _stated_covariance(fit: _Fit, stated: tuple[float, float] | None) -> tuple[F
 
 
 def _next_move(found: HandEye, problem: _Problem) -> NextMove:
-    """The turn of the flange round the target, from the middle of the poses, that makes the rig's place surest."""
-    robot, seen, kind = problem
+    """Turn of the flange round the target, from the middle of the poses, that determines the rig's position best."""
+    robot, views, kind = problem
     places = robot.poses[:, :3, 3]
     middle = int(np.argmin(np.linalg.norm(places - places.mean(axis=0), axis=1)))
     more = problem.select(np.append(np.arange(len(places)), middle))
-    # Beside those that are, as one of its own.
-    more.seen.covariance[: -seen.terms, -seen.terms :] = 0
-    more.seen.covariance[-seen.terms :, : -seen.terms] = 0
+    # In addition to the given poses, independent of them.
+    more.views.covariance[: -views.terms, -views.terms :] = 0
+    more.views.covariance[-views.terms :, : -views.terms] = 0
     pivot = ((robot.poses[middle] if kind is HandEyeKind.FIXED else np.eye(4)) @ found.target)[:3, 3]
     moves = []
     for axis, degrees in product("xyz", (_NEXT_TURN_DEG, -_NEXT_TURN_DEG)):
@@ -661,11 +661,11 @@ def _next_move(found: HandEye, problem: _Problem) -> NextMove:
         flange = more.robot.poses[-1]
         flange[:3, :3] = turn @ robot.poses[middle, :3, :3]
         flange[:3, 3] = pivot + turn @ (places[middle] - pivot)
-        more.seen.poses[-1] = np.linalg.inv(found.rig) @ kind.moved(flange) @ found.target
+        more.views.poses[-1] = np.linalg.inv(found.rig) @ kind.motion(flange) @ found.target
         covariance = _posterior(found.rig, found.target, more, found.robot_sigma)
-        words = (
+        text = (
             f"from pose '{robot.names[middle]}' turn the flange by {degrees:+g}° about the base's {axis} axis, round "
             "the target, which then stays in view"
         )
-        moves.append(NextMove(flange.copy(), float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])), words))
+        moves.append(NextMove(flange.copy(), float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])), text))
     return min(moves, key=lambda each: each.sigma_mm)

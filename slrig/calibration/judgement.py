@@ -30,7 +30,7 @@ from slrig.model import Calibration, FloatArray, Pinhole
 
 
 class Grade(StrEnum):
-    """What to do with a calibration."""
+    """Verdict on the use of a calibration."""
 
     GOOD = "good"
     USABLE = "usable"
@@ -152,7 +152,7 @@ def check_scale(solution: Solution, earlier: Calibration, board: Board) -> Scale
         )
         return ScaleCheck(True, change, sigma, (message,))
     message = (
-        f"the devices are not placed as in the earlier calibration ({changed}): the rig was rebuilt, or a device was "
+        f"the devices have moved since the earlier calibration ({changed}): the rig was rebuilt, or a device was "
         "bumped. If neither is true, measure both rulers of the board, and calibrate again"
     )
     return ScaleCheck(True, float("nan"), sigma, (message,))
@@ -332,7 +332,7 @@ def _summary(grade: Grade, expected: ExpectedError | None, tolerance_mm: float, 
     note = "; it cannot scan alone: that takes a projector or a second camera, calibrated with it" if single else ""
     if grade is Grade.GOOD:
         return f"good{error}, within the limit of {tolerance_mm / _SIGMAS:.2g} mm{note}"
-    return f"{grade.label}{error}; {count} thing{'s' if count > 1 else ''} to look at{note}"
+    return f"{grade.label}{error}; {count} thing{'s' if count > 1 else ''} to check{note}"
 
 
 def _diagonal_mm(expected: ExpectedError) -> float:
@@ -395,7 +395,7 @@ def _grade_poses(solution: Solution) -> Iterator[GradedFigure]:
     if left_out:
         ratio = left_out / (used + left_out)
         listed = "; ".join(f"{name}: {why}" for name, why in solution.outliers.items())
-        message = f"{left_out} of {used + left_out} poses left out ({listed}): shoot them again, and let nothing move"
+        message = f"{left_out} of {used + left_out} poses left out ({listed}): shoot them again, and move nothing"
         yield GradedFigure(LIMITS["outlier_poses"].grade(ratio), "outlier_poses", None, ratio, message, is_remark=True)
 
 
@@ -404,7 +404,7 @@ def _grade_residuals(name: str, residuals: DeviceResiduals) -> Iterator[GradedFi
     figure = "projector_rms_px" if projector else "camera_rms_px"
     worst, usual_px = _worst_pose(residuals), LIMITS[figure].good
     if worst:
-        remedy = f"look at {worst[0]} first ({worst[1]:.2g} px)"
+        remedy = f"check {worst[0]} first ({worst[1]:.2g} px)"
     elif projector:
         remedy = "all poses are alike: check that the exposure is a multiple of the refresh period, and the focus"
     else:

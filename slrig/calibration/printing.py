@@ -44,7 +44,7 @@ _STROKE_MM = 0.15
 _BORDER_GREY, _INK_GREY = 0.8, 0.25
 _POINTS_PER_MM = 72 / 25.4
 _STREAM = 4
-"""Number of the object of a PDF that holds what is drawn."""
+"""Number of the object of a PDF that holds the drawing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,9 +242,9 @@ def board_pdf(board: Board, *, page: str = "A4") -> bytes:
         f"<< /Title {_pdf_text(content.title)} /Creator (slrig) >>",
     ]
     document, places = b"%PDF-1.4\n", []
-    for number, words in enumerate(objects, 1):
+    for number, body in enumerate(objects, 1):
         places.append(f"{len(document):010} 00000 n \n")
-        inside = words.encode("cp1252", "replace") + (stream + b"\nendstream" if number == _STREAM else b"")
+        inside = body.encode("cp1252", "replace") + (stream + b"\nendstream" if number == _STREAM else b"")
         document += b"%d 0 obj\n%b\nendobj\n" % (number, inside)
     count = len(objects) + 1
     ending = (

@@ -235,7 +235,7 @@ def _reject_other_board(board: Board, layout: Any, ids: IntArray, outlines: Floa
 
 
 def _suggest_corners(board: Board, ids: IntArray, outlines: FloatArray) -> str:
-    """Describe what to do about the board of these markers, which is another one."""
+    """Describe the remedy for another board with these markers."""
     columns = matching_columns(ids, outlines)
     if columns == board.rows != board.columns:
         return (

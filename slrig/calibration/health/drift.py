@@ -111,7 +111,7 @@ def linearise(poses: Sequence[PoseObservation], board: Board, calibration: Calib
     if not len(measurements.corner_px):
         views = sorted({name for pose in poses for name in pose.views})
         message = (
-            f"the calibration is of camera {', '.join(names)}, the board was seen by {', '.join(views) or 'none'}: "
+            f"the calibration is of camera {', '.join(names)}, the board is visible in {', '.join(views) or 'none'}: "
             "check that the calibration is of the rig that shot the board"
         )
         raise CalibrationError(message)
@@ -404,7 +404,7 @@ def equally_likely(ranked: Sequence[Hypothesis], /) -> tuple[Hypothesis, ...]:
 def estimate_board_growth(equations: Equations, calibration: Calibration, /) -> tuple[float, float]:
     """Relative growth of the board that would explain the residuals without a change of a device, and its evidence.
 
-    A board that grew looks like a rig that shrank, with smaller distances between all devices.
+    A larger board has the same effect as a smaller rig, with smaller distances between all devices.
     """
     devices = list(devices_by_name(calibration).values())
     columns = np.zeros((len(devices), DEVICE))
@@ -510,7 +510,7 @@ def describe_alternatives(
             pair = "one camera and one projector" if calibration.projector is not None else "two cameras"
             parts.append(f"{pair} cannot distinguish a device that moved from the opposite move of the other one")
         elif best.has_turn and {best.device} != {each.device for each in others}:
-            parts.append("a turn about the line between both devices looks the same for either, other turns nearly so")
+            parts.append("a turn about the line between both devices is the same for either, other turns nearly so")
     if growth:
         parts.append(
             f"or the board is {abs(growth):.2%} {'larger' if growth > 0 else 'smaller'} than stated: only its size "
@@ -522,7 +522,7 @@ def describe_alternatives(
 def describe_remedy(best: Hypothesis, /) -> str:
     """Describe what to do about a change."""
     if best.kind is Change.FOCAL:
-        return "lock its lens, let the rig warm up, and calibrate again"
+        return "lock its lens, wait until the rig is warm, and calibrate again"
     mount = "the projector's mount" if best.device == PROJECTOR else f"the mount of {device_title(best.device)}"
     return f"check {mount}, and calibrate again"
 

@@ -98,7 +98,7 @@ class Verification:
 
     @property
     def error_ratio(self) -> float | None:
-        """The current error over that after the calibration, both without the board's size; None where untold."""
+        """The current error over that after the calibration, both without the board's size; None if unknown."""
         return self.expected_mm / self.stated_mm if self.expected_mm is not None and self.stated_mm else None
 
     def document(self) -> dict[str, Any]:
@@ -174,8 +174,8 @@ def verification_from_scan(pairs: Sequence[Mapping[str, Any]], /) -> Verificatio
 
 
 def scan_error_mm(solved: SolveRecord | None, found: Verification | None, /) -> float | None:
-    """The expected error of a scanned point now, mm: that of the solve, the board's size included, with what has
-    changed since by the last verification with the board. None where the calibration says nothing of its own error.
+    """The expected error of a scanned point now, mm: that of the solve, the board's size included, with the changes
+    since, by the last verification with the board. None where the calibration states no error.
     """
     if solved is None:
         return None
@@ -229,7 +229,7 @@ def _error_reasons(verifications: Sequence[Verification]) -> _Reasons:
     )
     reason = (
         "something changed since the calibration: without the board's size, the expected error of a scan is "
-        f"{ratio:.1f} times what it was"
+        f"{ratio:.1f} times as large"
     )
     likely, certain = evidence > limits.watch_evidence, sigmas > limits.sure_sigmas
     if (ratio > limits.stale_error_ratio and likely) or (ratio > limits.sure_error_ratio and certain):

@@ -313,12 +313,12 @@ class _PoseChecker:
 
     def check_quality(self, camera: str, quality: ViewQuality, view: BoardView) -> None:
         limits, blur_px, moved_px = LIMITS, quality.sharpness_px, quality.moved_px
-        remedy = f"at most {limits.moved_px[1]:g} px: rest the board on something, let go of it, and shoot again"
+        remedy = f"at most {limits.moved_px[1]:g} px: rest the board on something, release it, and shoot again"
         finding = f"saw the board move by {moved_px:.2g} px while the pose was shot"
         if np.isinf(moved_px):
             # A frame with late light shows two patterns at once, and no board is found in it.
             finding = "saw the board in the first frame and not in a later one, where it moved or the light came late"
-            remedy = "rest the board on something, let go of it, and shoot again; slrig doctor measures the light"
+            remedy = "rest the board on something, release it, and shoot again; slrig doctor measures the light"
         self.check_limit(moved_px, limits.moved_px, camera, finding, remedy)
         self.check_limit(
             quality.saturated, limits.saturated, camera, f"has {quality.saturated:.1%} of the board's pixels saturated",

@@ -458,7 +458,7 @@ def _describe_move(candidate: PoseCandidate, camera: str, last: Attitude, uprigh
     if abs(about_y) >= _MIN_TILT_DEG:
         parts.append(f"tilt its {'right' if about_y > 0 else 'left'} edge {abs(about_y):.0f}° towards the camera")
     if max(abs(about_x), abs(about_y)) < _MIN_TILT_DEG:
-        parts.append("let it face the camera")
+        parts.append("turn it to face the camera")
     turn = 5 * round(wrap_deg(candidate.turn_deg - last.turn_deg, period_deg) / 5)
     if abs(turn) > _SAME_TURN_DEG:
         parts.append(f"turn it {abs(turn):.0f}° {'clockwise' if turn > 0 else 'anticlockwise'} in its plane")

@@ -322,7 +322,7 @@ def choose_shape(problem: AdjustmentProblem, fit: Fit, shapes: Sequence[ShapePri
         fitted.append(total_loss(adjusted.residuals, sigma, inliers))
         result = evaluate_held_out(trial, adjusted.geometry, richest.noise, folds, inliers)
         held_out.append(sum(result.loss.values()))
-        # With few poses, those held out are far from what the others determine, and their loss is a matter of chance. A
+        # With few poses, the others determine those held out poorly, and their loss is a matter of chance. A
         # real shape also lowers the loss at the poses that it is fitted to.
         margin = MARGIN * (_TERM_COUNTS[number] - _TERM_COUNTS[best])
         if min(held_out[best] - held_out[number], fitted[best] - fitted[number]) > margin:

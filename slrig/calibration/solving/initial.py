@@ -5,7 +5,7 @@ one camera: IPPE (Collins and Bartoli 2014). Each pose that two cameras share gi
 one that most others agree with is taken. The corners of a chessboard that looks the same after half a turn may be
 counted from either end: both are tried, and the one that agrees with the other poses is taken.
 
-Parallel boards have one vanishing line and look parallel with any focal length, so they do not determine it. Tilts are
+Parallel boards have one vanishing line and are parallel with any focal length, so they do not determine it. Tilts are
 checked with the lens that was found and, if its focal length is poorly determined, with a typical one too.
 """
 
@@ -124,7 +124,7 @@ def _decompose(matrix: FloatArray, points: FloatArray, size: Size) -> FloatArray
     if not np.isfinite(lens).all() or not 0.1 < lens[0, 0] / lens[1, 1] < 10 or lens[0, 0] > 1e3 * size.width_px:
         message = (
             f"the projector's light and the board's poses do not match (focal lengths {lens[0, 0]:.0f} and "
-            f"{lens[1, 1]:.0f} px): shoot the board at several distances and tilts, and make sure that it stands still"
+            f"{lens[1, 1]:.0f} px): shoot the board at several distances and tilts, and make sure that it does not move"
         )
         raise SolveRefusedError(message)
     return device_row(

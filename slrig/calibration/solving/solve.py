@@ -104,11 +104,11 @@ def solve(
     corners_only = replace(everything, measurements=everything.measurements.select_poses(visible, matches=False))
     geometry = flat_geometry(observations.board, initial.devices, initial.poses)
     shapes = candidate_shapes(observations.board, board_shape)
-    # Fit the stretch first: a stretched print looks like a bent one, and its poses seem to contradict one another.
+    # Fit the stretch first: a stretched print resembles a bent one, and its poses seem to contradict one another.
     fit, stretch = fit_stretch(corners_only, fit_geometry(corners_only, geometry), observations.board)
     if observations.projector is None:
         corners_only, fit = _choose_shape_and_poses(corners_only, fit.geometry, outliers, shapes)
-    # With a projector all poses stay until then: its light tells which of two cameras moved.
+    # With a projector all poses stay until then: its light shows which of two cameras moved.
 
     problem, sizes = corners_only, dict(observations.cameras)
     if observations.projector is not None:
@@ -235,8 +235,8 @@ def _exclude_contradicting_poses(
         if len(outliers) > max_excluded_poses(problem):
             listed = "; ".join(f"'{name}': {why}" for name, why in outliers.items())
             message = (
-                f"{len(outliers)} of {len(problem.pose_names)} poses contradict the others, too many to tell which are "
-                f"right: {listed}. Check that board and devices stand still and that all poses are of one rig and board"
+                f"{len(outliers)} of {len(problem.pose_names)} poses contradict the others, too many to know which are "
+                f"right: {listed}. Check that board and devices do not move and that all poses are of one rig and board"
             )
             raise SolveRefusedError(message)
         mask = np.zeros(len(problem.pose_names), dtype=np.bool_)
@@ -259,7 +259,7 @@ def _refuse_contradiction(problem: AdjustmentProblem, fit: Fit) -> None:
             message = (
                 f"the poses contradict one another: the residuals of '{name}' are {noise.excess_px:.0f} px, and a "
                 "tenth of a pixel is usual; check that all poses are of this rig and of one board with the given size, "
-                "and that board and devices stand still while a pose is shot"
+                "and that board and devices do not move while a pose is shot"
             )
             raise SolveRefusedError(message)
 
@@ -361,7 +361,7 @@ def _find_moved_device(
     remaining = float(np.sqrt(max(total - best, 0.0) / total)) if total > 0 else 1.0
     if remaining > _MAX_MOVED_RESIDUAL:
         return None
-    # A single contradicting pose among the last ones looks like a move; check that leaving it out does not explain as
+    # A single contradicting pose among the last ones resembles a move; check that leaving it out does not explain as
     # much.
     for excluded in range(len(used)):
         rest = np.arange(len(used)) != excluded

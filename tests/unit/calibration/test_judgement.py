@@ -120,7 +120,7 @@ def _left(rms_px: float = 0.08, **changes: Any) -> Solution:
 @pytest.mark.parametrize(
     ("solution", "words"),
     [
-        (_left(0.31, pose_rms_px=WORST), r"'left' has 0.31 px rms.*usual is 0.05–0.2.*look at pose_07 first .0.9 px"),
+        (_left(0.31, pose_rms_px=WORST), r"'left' has 0.31 px rms.*usual is 0.05–0.2.*check pose_07 first .0.9 px"),
         (replace(_solution(), poses=POSES), "6 poses used.*20 to 30 are usual"),
         (replace(_solution(), outliers={"pose_12": "it moved"}), r"1 of 13 poses left out \(pose_12: it moved\)"),
         (_known(2 * EACH + 3, 9.0), "projector: the principal row is 860.0 ± 9 px.*about the horizontal axis"),

@@ -189,7 +189,7 @@ def test_a_device_that_was_knocked_is_turned_and_moved() -> None:
 def test_a_rig_of_other_cameras_is_refused_with_words() -> None:
     rig = bench()
     other = Calibration({"front": rig.calibration.cameras["left"]}, rig.calibration.projector)
-    with pytest.raises(CalibrationError, match="of camera front, the board was seen by left: check that"):
+    with pytest.raises(CalibrationError, match="of camera front, the board is visible in left: check that"):
         verify_by_board([look_of(rig.devices, 0)], BOARD, other)
 
 

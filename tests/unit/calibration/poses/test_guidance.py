@@ -381,7 +381,7 @@ def test_a_first_pose_has_a_tilt_and_no_distance_while_the_focal_length_is_unkno
 @pytest.mark.parametrize(
     ("figures", "refusals", "warnings"),
     [
-        (replace(SHARP, moved_px=1.3), ["saw the board move by 1.3 px", "let go of it"], []),
+        (replace(SHARP, moved_px=1.3), ["saw the board move by 1.3 px", "release it"], []),
         (replace(SHARP, moved_px=float("inf")), ["in the first frame and not in a later one", "shoot again"], []),
         (replace(SHARP, sharpness_px=4.0), ["too blurred, 4.0 px", "focus"], []),
         (replace(SHARP, saturated=0.2), ["20.0% of the board's pixels saturated", "shorter time"], []),
