@@ -72,9 +72,9 @@ class Trigger(StrEnum):
 class CameraInfo:
     """Declared data of a camera.
 
-    triggers : supported triggers. limits : time-outs of its calls. notes : remarks for the user about how the camera is
-    set up, each a sentence with the remedy. colour : True if its frames have `Frame.colour`. exposed_by_pulse : True if
-    a wire's pulse is its exposure, so that it cannot tell how long it exposed.
+    triggers : supported triggers. limits : time-outs of its calls. notes : remarks for the user about the camera's
+    set-up, each a sentence with the remedy. colour : True if its frames have `Frame.colour`. exposed_by_pulse : True if
+    a wire's pulse is its exposure, so that it cannot report how long it exposed.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Checks of what drivers return. A driver is somebody else's code: each function raises TypeError or ValueError for
+"""Checks of values that drivers return. A driver is third-party code: each function raises TypeError or ValueError for
 values that no device has, which are a defect of the driver, and returns the value with its text safe to print.
 """
 
@@ -18,8 +18,8 @@ from slrig.model import CameraFormat, Frame, Pixels, Size
 from slrig.printable import foreign_text
 
 MAX_AHEAD_S = 10.0
-"""How far ahead of the rig's clock a time may lie. A display lights its picture some refreshes after it was asked to,
-and a camera's own clock is read with some error; more is the time of another clock."""
+"""Largest time ahead of the rig's clock. A display lights its picture some refreshes after the request, and a camera's
+own clock is read with some error; more is the time of another clock."""
 
 _MAX_COUNT = 2**31
 _MAX_NS = 2**62
@@ -51,7 +51,7 @@ def require_number(value: Any, what: str, *, least: float = -math.inf, most: flo
 
 
 def require_camera_info(value: object) -> CameraInfo:
-    """Return what a camera declares."""
+    """Return a camera's declared data."""
     info = require_kind(value, CameraInfo)
     require_kind(info.format, CameraFormat)
     _require_size(info.format.size)
@@ -67,7 +67,7 @@ def require_camera_info(value: object) -> CameraInfo:
 
 
 def require_projector_info(value: object) -> ProjectorInfo:
-    """Return what a projector declares."""
+    """Return a projector's declared data."""
     info = require_kind(value, ProjectorInfo)
     _require_size(info.size)
     require_number(info.latency_s, "a latency", least=0.0)
@@ -112,7 +112,7 @@ def require_frame(value: object, camera: str, now_ns: int) -> Frame:
     require_number(frame.gain, "a gain")
     require_number(frame.shutter_skew_s, "a shutter skew", least=0.0)
     if not (frame.colour is None or callable(frame.colour)):
-        raise TypeError("it returned a frame whose colour cannot be asked for")
+        raise TypeError("it returned a frame whose colour cannot be called")
     return frame
 
 
@@ -128,11 +128,11 @@ def require_colour(value: object, frame: Frame) -> Pixels:
 
 
 def require_displayed(value: object, index: int, now_ns: int) -> DisplayedPattern:
-    """Return when a pattern is lit. index : of the pattern. now_ns : by the rig's clock, after it was asked for."""
+    """Return when a pattern is lit. index : of the pattern. now_ns : by the rig's clock, after the request."""
     shown = require_kind(value, DisplayedPattern)
     whole = _is_whole(shown.t_visible_ns, _MAX_NS) and _is_whole(shown.t_err_ns, _MAX_NS)
     if not whole or shown.index != index or shown.t_err_ns < 0:
-        raise ValueError(f"asked for pattern {index}, it returned {foreign_text(repr(shown))[:200]}")
+        raise ValueError(f"requested pattern {index}, it returned {foreign_text(repr(shown))[:200]}")
     if shown.t_visible_ns + shown.t_err_ns > now_ns + MAX_AHEAD_S * 1e9:
         raise ValueError(
             f"pattern {index} is to be lit {(shown.t_visible_ns + shown.t_err_ns - now_ns) / 1e9:.6g} s after the "

@@ -15,7 +15,7 @@ from slrig.model import Pattern, PatternSequence, Size
 class ProjectorInfo:
     """Declared data of a projector.
 
-    plays : True if it can step through a loaded sequence by itself and trigger the cameras by wire. gap_s : shortest
+    plays : True if it can step through a loaded sequence on its own and trigger the cameras by wire. gap_s : shortest
     time from the end of a pattern's light to the next pulse; duty : largest fraction of time with light. latency_s :
     typical time from `show` to light. refresh_s : refresh period of a projector whose light is constant only over whole
     periods; None if exposures may have any length. limits : time-outs of its calls. recorded : patterns of a recording,
@@ -158,7 +158,7 @@ class ProjectorState:
         """Return the loaded sequence. Raises DeviceStateError: nothing is loaded, with `action` in the message."""
         self.require_open()
         if self.loaded is None:
-            raise DeviceStateError(f"asked to {action}, no sequence is loaded; call load first")
+            raise DeviceStateError(f"cannot {action}: no sequence is loaded; call load first")
         return self.loaded
 
     def require_pattern(self, index: int) -> PatternSequence:
@@ -168,7 +168,7 @@ class ProjectorState:
         """
         sequence = self.require_loaded(f"show pattern {index}")
         if not 0 <= index < len(sequence):
-            message = f"asked to show pattern {index}, the loaded sequence has patterns 0 to {len(sequence) - 1}"
+            message = f"requested pattern {index}, the loaded sequence has patterns 0 to {len(sequence) - 1}"
             raise UnsupportedByDeviceError(message)
         return sequence
 
@@ -182,6 +182,6 @@ class ProjectorState:
         """Raise UnsupportedByDeviceError: this projector cannot trigger cameras."""
         self.require_open()
         raise UnsupportedByDeviceError(
-            f"asked to play {exposure_s} s patterns every {period_s} s, {self.label} has no trigger wire; show each "
+            f"requested {exposure_s} s patterns every {period_s} s, but {self.label} has no trigger wire; show each "
             "pattern, and trigger the cameras by software"
         )

@@ -89,7 +89,7 @@ class Turntable(Positioner, Protocol):
 
     @property
     def opened_at_deg(self) -> float | None:
-        """Angle in the device's own count when it was opened, which it keeps unless it was restarted or moved by hand.
+        """Angle in the device's own count when it was opened, which it keeps unless it was restarted or moved manually.
         None if opening brings it to a fixed position.
         """
         ...
@@ -132,7 +132,7 @@ class TurntableBase(ABC):
         """See `Positioner`."""
         if not 0 <= index < len(self._names):
             message = (
-                f"asked for pose {index}, the turntable has poses 0 to {len(self._names) - 1}: "
+                f"requested pose {index}, the turntable has poses 0 to {len(self._names) - 1}: "
                 f"{', '.join(self._names)}; take one of them, or set another number of `poses` in the rig file"
             )
             raise UnsupportedByDeviceError(message)
@@ -169,8 +169,8 @@ class ScannerHead(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class FoundDevice:
-    """A connected device: its driver, its id for the rig file, and a label. options : further ones for its table, as
-    the device stands now, which it is not opened without.
+    """A connected device: its driver, its id for the rig file, and a label. options : further ones that its table
+    needs, by the device's present state.
     """
 
     driver: str

@@ -114,7 +114,7 @@ def is_notch(points: Any, faces: Any, adjacency: Any, into: int, out: int) -> bo
     """True for Fig. 8(a) at the corner between half-edges `into` (a to b) and `out` (b to c), False for Fig. 8(b).
 
     n' = (c - b) x (a - b), n the mean of the unit normals of the corner's triangles. With the surface to the left,
-    n' looks along n where the boundary turns left (a spike of surface) and against it where it turns right (a notch
+    n' points along n where the boundary turns left (a spike of surface) and against it where it turns right (a notch
     in the surface): angle (n', n) > π/2 is a notch.
     """
     face, corner = into // 3, (into + 2) % 3
@@ -152,7 +152,7 @@ def _has_edge(faces: Any, adjacency: Any, degree: Any, into: int, other: int) ->
 
 @kernel_part
 def _is_inside(points: Any, p: int, a: int, b: int, c: int, normal: Any) -> bool:
-    """True if p, projected along the normal of triangle abc, lies inside it or on its edge."""
+    """True if p, projected along the normal of triangle abc, is inside it or on its edge."""
     for u, v in ((a, b), (b, c), (c, a)):
         if _dot(_cross(_difference(points, v, u), _difference(points, p, u)), normal) < 0.0:
             return False

@@ -1,4 +1,4 @@
-"""Which way triangles face, and which of them are mirror images.
+"""Orientation of triangles to the devices, and detection of mirror images.
 
 A triangle of the surface faces every device that measured it: the camera that sees it and the projector that lights it,
 or both cameras of a pair. Light that a mirror sends on reverses the order of the columns in the camera's image, so the
@@ -48,9 +48,9 @@ def facing_sides(points_mm: FloatArray, faces: IntArray, views: Viewpoints, /) -
 
 @dataclass(frozen=True, slots=True)
 class FrontSides:
-    """How triangles lie to the devices that measured them.
+    """Orientation of triangles to the devices that measured them.
 
-    mirrored : (F,) bool, mirror images: they face only one of their devices, and are no work of noise.
+    mirrored : (F,) bool, mirror images: they face only one of their devices, and not because of noise.
     turned : (F,) bool, those whose vertices have to be reversed to run counter-clockwise seen from their camera.
     """
 
@@ -63,9 +63,9 @@ def front_sides(points_mm: FloatArray, faces: IntArray, views: Viewpoints, among
 
     points_mm : (n, 3) float64; faces : (F, 3) int32. among : (F,) bool, the triangles that count.
 
-    Noise turns single triangles that are nearly edge-on. So triangles that lie otherwise than the others and meet in a
-    vertex are judged together: one of them has to be three standard deviations from edge-on for every device. What
-    noise turned winds as the others, and may be cured by flips of edges.
+    Noise turns single triangles that are nearly edge-on. So triangles oriented otherwise than the others that meet in a
+    vertex are judged together: one of them has to be three standard deviations from edge-on for every device. Triangles
+    turned by noise wind as the others, and flips of edges may correct them.
     """
     sides = facing_sides(points_mm, faces, views)
     usual = 1 if int(np.sum(sides, where=among, dtype=np.int64)) >= 0 else -1
@@ -98,8 +98,8 @@ def _is_certain(points_mm: FloatArray, faces: IntArray, views: Viewpoints) -> ND
         variance = np.zeros(len(faces))
         for corner, slope in enumerate(slopes):
             variance += np.einsum("ij,ij->i", slope, views.deviation_mm[faces[:, corner]]) ** 2
-        not_seen = ((views.camera[faces] != index) & (views.second[faces] != index)).all(axis=1)
-        certain &= not_seen | (volume**2 > _MIN_SIGMA**2 * variance)
+        unseen = ((views.camera[faces] != index) & (views.second[faces] != index)).all(axis=1)
+        certain &= unseen | (volume**2 > _MIN_SIGMA**2 * variance)
     return certain
 
 

@@ -22,8 +22,8 @@ def nearest_on_triangle(
     """Squared distance from p to a triangle, and the barycentric weights of the nearest point.
 
     Exact for slivers and collapsed triangles too. points : (n, 3), that a, b, c are rows of. Weights are exactly 0
-    where the nearest point is on an edge. It is the foot of the perpendicular if that lies inside, else on an edge that
-    the foot lies beyond (Ericson 2004, "Real-time collision detection", 5.1).
+    where the nearest point is on an edge. It is the foot of the perpendicular if that is inside, else on an edge
+    beyond which the foot is (Ericson 2004, "Real-time collision detection", 5.1).
     """
     ax, ay, az = points[a, 0] - px, points[a, 1] - py, points[a, 2] - pz
     bx, by, bz = points[b, 0] - px, points[b, 1] - py, points[b, 2] - pz

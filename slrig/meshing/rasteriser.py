@@ -28,13 +28,13 @@ class RasterView(NamedTuple):
     face: IntArray
 
 
-def rasterise(placed: NDArray[np.float32], faces: IntArray, size: Size) -> RasterView:
-    """Rasterise a mesh. placed : (V, 3) float32, column and row, pixels, and depth, mm, of its vertices.
+def rasterise(points: NDArray[np.float32], faces: IntArray, size: Size) -> RasterView:
+    """Rasterise a mesh. points : (V, 3) float32, column and row, pixels, and depth, mm, of its vertices.
 
     Interpolates inverse depth, which is linear in the image. Skips triangles with a vertex behind the camera.
     """
     at_least = max(_MIN_FACES, -(-len(faces) // _MAX_BANDS))
-    given = np.ascontiguousarray(placed), np.ascontiguousarray(faces), size.height_px, size.width_px
+    given = np.ascontiguousarray(points), np.ascontiguousarray(faces), size.height_px, size.width_px
     inverse, face = merge_depth_buffers(in_bands(_z_buffer, len(faces), *given, rows_at_least=at_least))
     empty = inverse == 0
     inverse[empty] = np.nan
@@ -42,12 +42,12 @@ def rasterise(placed: NDArray[np.float32], faces: IntArray, size: Size) -> Raste
     return RasterView(np.reciprocal(inverse, out=inverse), face)
 
 
-def depth_ranges(placed: NDArray[np.floating[Any]], faces: IntArray, size: Size) -> tuple[FloatArray, FloatArray]:
+def depth_ranges(points: NDArray[np.floating[Any]], faces: IntArray, size: Size) -> tuple[FloatArray, FloatArray]:
     """(H, W) float64 each: nearest and furthest depth of the triangles at each pixel centre, mm; inf and -inf without
-    a triangle. placed : (V, 3), column and row, pixels, and depth, mm, which counts as linear in the image.
+    a triangle. points : (V, 3), column and row, pixels, and depth, mm, which counts as linear in the image.
     """
     at_least = max(_MIN_FACES, -(-len(faces) // _MAX_BANDS))
-    given = np.ascontiguousarray(placed), np.ascontiguousarray(faces), size.height_px, size.width_px
+    given = np.ascontiguousarray(points), np.ascontiguousarray(faces), size.height_px, size.width_px
     bands = in_bands(_depth_ranges, len(faces), *given, rows_at_least=at_least)
     nearest, furthest = np.full(size.shape, np.inf), np.full(size.shape, -np.inf)
     for near, far in bands:
@@ -56,10 +56,10 @@ def depth_ranges(placed: NDArray[np.floating[Any]], faces: IntArray, size: Size)
     return nearest, furthest
 
 
-def covered_pixels(placed: NDArray[np.float32], faces: IntArray, size: Size) -> NDArray[np.bool_]:
+def covered_pixels(points: NDArray[np.float32], faces: IntArray, size: Size) -> NDArray[np.bool_]:
     """(H, W) bool: pixel centres that a triangle covers. Arguments as for `rasterise`."""
     covered = np.zeros(size.shape, dtype=np.bool_)
-    given = np.ascontiguousarray(placed), np.ascontiguousarray(faces), covered
+    given = np.ascontiguousarray(points), np.ascontiguousarray(faces), covered
     in_bands(_cover, len(faces), *given, rows_at_least=_MIN_FACES)
     return covered
 
@@ -77,29 +77,29 @@ def merge_depth_buffers(buffers: list[tuple[Nearness, IntArray]]) -> tuple[Nearn
 
 
 def rasterise_normals(
-    view: RasterView, placed: NDArray[np.float32], normals: NDArray[np.float32], faces: IntArray
+    view: RasterView, points: NDArray[np.float32], normals: NDArray[np.float32], faces: IntArray
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Normal of the visible side at every pixel, and a mask of pixels that show a front.
 
-    placed, faces : the arguments of `rasterise`. normals : (V, 3) float32 of the vertices, in any frame; NaN counts as
+    points, faces : the arguments of `rasterise`. normals : (V, 3) float32 of the vertices, in any frame; NaN counts as
     0. Returns (H, W, 3) float32 normals in that frame, unit, reversed for backs, 0 without a triangle; and (H, W) bool,
     True if the triangle is counter-clockwise in the image.
     """
     out, front = np.zeros((*view.face.shape, 3), dtype=np.float32), np.zeros(view.face.shape, dtype=np.bool_)
-    given = np.ascontiguousarray(placed), np.ascontiguousarray(normals), np.ascontiguousarray(faces)
+    given = np.ascontiguousarray(points), np.ascontiguousarray(normals), np.ascontiguousarray(faces)
     in_bands(_normals, len(out), view.face, *given, out, front, rows_at_least=16)
     return out, front
 
 
 @kernel
 def _z_buffer(
-    first: int, last: int, placed: Any, faces: Any, height: int, width: int
+    first: int, last: int, points: Any, faces: Any, height: int, width: int
 ) -> tuple[NDArray[np.float32], IntArray]:
     """Inverse depth, 0 without a triangle, and index of the nearest triangle from first to last."""
     inverse = np.zeros((height, width), dtype=np.float32)
     nearest = np.zeros((height, width), dtype=np.int32)
     for face in range(first, last):
-        a, b, c = placed[faces[face, 0]], placed[faces[face, 1]], placed[faces[face, 2]]
+        a, b, c = points[faces[face, 0]], points[faces[face, 1]], points[faces[face, 2]]
         if not (a[2] > 0.0 and b[2] > 0.0 and c[2] > 0.0):
             continue
         ax, bx, cx = float(a[0]), float(b[0]), float(c[0])
@@ -130,16 +130,16 @@ def _z_buffer(
 
 @kernel
 def _depth_ranges(
-    first: int, last: int, placed: Any, faces: Any, height: int, width: int
+    first: int, last: int, points: Any, faces: Any, height: int, width: int
 ) -> tuple[FloatArray, FloatArray]:
     nearest, furthest = np.full((height, width), np.inf), np.full((height, width), -np.inf)
     for face in range(first, last):
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-        ax, bx, cx = placed[a, 0], placed[b, 0], placed[c, 0]
+        ax, bx, cx = points[a, 0], points[b, 0], points[c, 0]
         left, right = max(np.ceil(min(ax, bx, cx)), 0.0), min(np.floor(max(ax, bx, cx)), width - 1.0)
         if not left <= right:
             continue
-        ay, by, cy = placed[a, 1], placed[b, 1], placed[c, 1]
+        ay, by, cy = points[a, 1], points[b, 1], points[c, 1]
         top, bottom = max(np.ceil(min(ay, by, cy)), 0.0), min(np.floor(max(ay, by, cy)), height - 1.0)
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if not top <= bottom or not abs(area) > 0.0:
@@ -150,18 +150,18 @@ def _depth_ranges(
                 wb = ((cx - column) * (ay - row) - (cy - row) * (ax - column)) / area
                 wc = 1.0 - wa - wb
                 if wa >= 0.0 and wb >= 0.0 and wc >= 0.0:
-                    depth = wa * placed[a, 2] + wb * placed[b, 2] + wc * placed[c, 2]
+                    depth = wa * points[a, 2] + wb * points[b, 2] + wc * points[c, 2]
                     nearest[row, column] = min(nearest[row, column], depth)
                     furthest[row, column] = max(furthest[row, column], depth)
     return nearest, furthest
 
 
 @kernel
-def _cover(first: int, last: int, placed: Any, faces: Any, covered: Any) -> None:
+def _cover(first: int, last: int, points: Any, faces: Any, covered: Any) -> None:
     """Mark the pixels of the triangles from first to last, as `_z_buffer` draws them."""
     height, width = covered.shape
     for face in range(first, last):
-        a, b, c = placed[faces[face, 0]], placed[faces[face, 1]], placed[faces[face, 2]]
+        a, b, c = points[faces[face, 0]], points[faces[face, 1]], points[faces[face, 2]]
         if not (a[2] > 0.0 and b[2] > 0.0 and c[2] > 0.0):
             continue
         ax, bx, cx = float(a[0]), float(b[0]), float(c[0])
@@ -181,7 +181,7 @@ def _cover(first: int, last: int, placed: Any, faces: Any, covered: Any) -> None
 
 
 @kernel
-def _normals(first: int, last: int, nearest: Any, placed: Any, normals: Any, faces: Any, out: Any, front: Any) -> None:
+def _normals(first: int, last: int, nearest: Any, points: Any, normals: Any, faces: Any, out: Any, front: Any) -> None:
     """Normals of the rows from first to last, weighted as inverse depth is."""
     for row in range(first, last):
         for column in range(nearest.shape[1]):
@@ -189,13 +189,13 @@ def _normals(first: int, last: int, nearest: Any, placed: Any, normals: Any, fac
             if face < 0:
                 continue
             a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-            ax, ay, bx, by = placed[a, 0] - column, placed[a, 1] - row, placed[b, 0] - column, placed[b, 1] - row
-            cx, cy = placed[c, 0] - column, placed[c, 1] - row
+            ax, ay, bx, by = points[a, 0] - column, points[a, 1] - row, points[b, 0] - column, points[b, 1] - row
+            cx, cy = points[c, 0] - column, points[c, 1] - row
             # Twice the areas of the parts opposite the corners, positive if clockwise in the image: a back. Divided
             # by depth they have the ratios of the parts of the triangle itself; their sum cancels in a unit vector.
             wa, wb, wc = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
             front[row, column] = wa + wb + wc < 0.0
-            wa, wb, wc = -wa / placed[a, 2], -wb / placed[b, 2], -wc / placed[c, 2]
+            wa, wb, wc = -wa / points[a, 2], -wb / points[b, 2], -wc / points[c, 2]
             x, y, z = 0.0, 0.0, 0.0
             for weight, corner in ((wa, a), (wb, b), (wc, c)):
                 nx, ny, nz = normals[corner, 0], normals[corner, 1], normals[corner, 2]

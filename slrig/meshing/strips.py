@@ -130,10 +130,10 @@ def _strip_neighbours(
             before = face - 1 if face > firsts[s] else -1
             after = face + 1 if face + 1 < firsts[s + 1] else -1
             if faces[face, 1] <= last_of_first:
-                # (i, i + 1, j): the step lies opposite j, the next triangle opposite i, the one before opposite i + 1.
+                # (i, i + 1, j): the step is opposite j, the next triangle opposite i, the one before opposite i + 1.
                 across[face, 0], across[face, 1], across[face, 2] = after, before, after_second[faces[face, 0]]
             else:
-                # (i, j + 1, j): the step lies opposite i.
+                # (i, j + 1, j): the step is opposite i.
                 across[face, 0], across[face, 1], across[face, 2] = after_first[faces[face, 2]], before, after
 
 
@@ -300,7 +300,7 @@ class _Piece:
         for piece in (self, other):
             begin = piece.last_at_or_before(after) if after > low else piece.first_at_or_after(low)
             end = piece.first_at_or_after(before) if before < high else piece.last_at_or_before(high)
-            # Both bounds between the same two points, if the other piece lies within one step.
+            # Both bounds between the same two points, if the other piece is within one step.
             run += [piece.first + min(begin, end), piece.first + max(begin, end)]
         if max(low, after) >= min(high, before):
             return None
@@ -336,11 +336,10 @@ MIN_COMPONENT = 100
 @dataclass(frozen=True, slots=True)
 class InitialMesh:
     """faces : (F, 3) int32 into the curves' points, counter-clockwise seen from the camera that measured them.
-    adjacency : (F, 3) int32, entry k is the face across the edge opposite corner k, -1 at a boundary.
-    mirror_faces : (M, 3) int32, the mirror images among the dropped triangles; few of them, as folds beside a depth
-    edge are, count as dust.
-    strip_triangles : Σ(I + J - 2), before dropping; the drops at edges and bridges overlap, mirror images are counted
-    of what they leave, and dust are the small components that remain then.
+    adjacency : (F, 3) int32, entry k is the face across the edge opposite corner k, -1 at a boundary. mirror_faces :
+    (M, 3) int32, the mirror images among the dropped triangles; few of them, such as folds next to a depth edge, count
+    as dust. strip_triangles : Σ(I + J - 2), before dropping; the drops at edges and bridges overlap, mirror images are
+    counted among the rest, and dust among what remains then: small components.
     """
 
     faces: IntArray
@@ -411,7 +410,7 @@ def initial_mesh(
 def _between_windings(
     adjacency: IntArray, turned: NDArray[np.bool_], connected: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """(F,) bool: turned triangles beside one that is not: with both, a mesh has no front."""
+    """(F,) bool: turned triangles next to one that is not: with both, a mesh has no front."""
     apart = np.zeros(len(turned), dtype=np.bool_)
     suspects = np.flatnonzero(turned & connected)
     if len(suspects) < np.count_nonzero(connected):

@@ -169,7 +169,7 @@ class SurfaceMesh:
     unit, NaN for points without a triangle. mirror_faces : (M, 3) int32, dropped mirror images. stages : in order.
     steps : statistics of each step: `initial`, `optimisation` (Fig. 10, round by round), `boundary` if it was smoothed,
     and `facing`: the triangles dropped in the end because a device that measured them sees their back, and the dust
-    that they leave.
+    left by that.
     """
 
     faces: IntArray
@@ -179,7 +179,7 @@ class SurfaceMesh:
     steps: Mapping[str, Mapping[str, object]]
 
     def among_points(self, mask: NDArray[np.bool_], /) -> SurfaceMesh:
-        """The same faces in points without those beside the mask, (n,) bool, which no face uses; no mirror images."""
+        """The same faces in points without those outside the mask, (n,) bool, which no face uses; no mirror images."""
         numbers = np.cumsum(mask, dtype=np.int32) - np.int32(1)
         return replace(self, faces=numbers[self.faces], normals=self.normals[mask], mirror_faces=self.mirror_faces[:0])
 
@@ -265,7 +265,7 @@ def build_surface(
     fronts = facing_sides(points_mm, faces, views) > 0
     backs, dust = len(faces) - int(np.count_nonzero(fronts)), 0
     if backs:
-        # Flips of edges cure most of what noise turned, and fold a few others over.
+        # Flips of edges correct most triangles that noise turned, and fold a few others over.
         remaining = component_sizes(faces, fronts) >= MIN_COMPONENT
         faces, adjacency = select_faces(faces, adjacency, remaining)
         dust = len(fronts) - backs - len(faces)

@@ -183,7 +183,7 @@ def light_map_coordinates(points_px: FloatArray, size: Size) -> FloatArray:
 class Calibration:
     """The devices of a rig in one world frame. `projector` is None if only the cameras were calibrated.
 
-    `solved` is None if the uncertainty is unknown: the calibration was written by hand, imported, or is exact. `light`
+    `solved` is None if the uncertainty is unknown: the calibration was written manually, imported, or is exact. `light`
     is None if the projector's light was not measured.
 
     Raises CalibrationError: the covariance is for another number of devices.

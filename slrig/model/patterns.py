@@ -182,7 +182,7 @@ class Sine:
 
     @property
     def inverse(self) -> Sine | None:
-        """The sinusoid half a period further; None if that is no whole number of steps."""
+        """The sinusoid half a period further; None if that is not a whole number of steps."""
         if self.steps % 2:
             return None
         return replace(self, shift=(self.shift + self.steps // 2) % self.steps)
@@ -191,7 +191,7 @@ class Sine:
 def sine_groups(patterns: Sequence[Sine]) -> list[list[int]]:
     """Return the indices of the frames of each period with three or more shifts, the finest period first.
 
-    Such frames give level, modulation and phase of a pixel by themselves.
+    Such frames alone give level, modulation and phase of a pixel.
     """
     periods = sorted({each.period_px for each in patterns})
     members = [[i for i, each in enumerate(patterns) if each.period_px == period] for period in periods]

@@ -1,7 +1,7 @@
-"""Whether the numbers of a calibration can be those of a structured-light rig: lenses, fields of view, distances.
+"""Check that the numbers of a calibration can be those of a structured-light rig: lenses, fields of view, distances.
 
-The limits are those of optics and of benches, far outside of what real rigs have: from microscopes with a baseline of a
-few millimetres to rooms. Numbers inside the limits can still be wrong; only the frames of a scan can tell that.
+The limits are those of optics and of benches, far beyond real rigs: from microscopes with a baseline of a few
+millimetres to rooms. Numbers inside the limits can still be wrong; only the frames of a scan can show that.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ reached; there a scan has no points."""
 _MAX_PINCUSHION = 1.2
 """Distorted radius over undistorted radius; pincushion lenses have up to 1.1."""
 _MAX_BELOW_FISHEYE = 0.15
-"""The same ratio is cos θ for the strongest fisheye, the orthographic one, at the angle θ; so much less is no lens."""
+"""The same ratio is cos θ for the strongest fisheye, the orthographic one, at the angle θ; no lens has so much less."""
 
 _FOCAL_PER_SIDE = (0.1, 200.0)
 """Focal length over the longer side of the image: fields of view of 157° and 0.3°."""
@@ -53,7 +53,7 @@ _MIN_CONVERGENCE = np.sin(np.deg2rad(3.0))
 
 
 def calibration_faults(calibration: Calibration, /) -> list[str]:
-    """Return what cannot be true of a calibration, one sentence each, beginning with the device; empty if all can."""
+    """Return the impossible numbers of a calibration, one sentence each, beginning with the device."""
     faults = [
         fault for name, device in calibration.cameras.items() for fault in device_faults(device, f"cameras.{name}")
     ]
@@ -80,7 +80,7 @@ def require_plausible(calibration: Calibration, source: str) -> None:
 
 
 def device_faults(device: Pinhole, place: str, *, is_projector: bool = False) -> list[str]:
-    """Return what cannot be true of a lens. place : the device, for messages."""
+    """Return the impossible numbers of a lens. place : the device, for messages."""
     sides = np.array([device.size.width_px, device.size.height_px], dtype=np.float64)
     focal = np.array([device.matrix[0, 0], device.matrix[1, 1]])
     principal = device.matrix[:2, 2]
@@ -111,7 +111,7 @@ def device_faults(device: Pinhole, place: str, *, is_projector: bool = False) ->
         if imaged < _MIN_IMAGED:
             faults.append(
                 f"{place}.distortion: expected a lens that images all of {device.size}, found one that folds within "
-                f"it, or bends rays more than any lens: {1 - imaged:.0%} of the image lies beyond "
+                f"it, or bends rays more than any lens: {1 - imaged:.0%} of the image is beyond "
                 f"({', '.join(f'{term:g}' for term in device.distortion)}). A calibration from too few views has such "
                 "numbers: solve with fewer terms, or with views that reach the corners"
             )
@@ -125,7 +125,7 @@ def imaged_share(device: Pinhole, /) -> float:
 
 
 def _is_weak_lens(device: Pinhole, points_px: FloatArray) -> bool:
-    """Return True if bounds of the distortion suffice to tell that the lens images all pixels.
+    """Return True if bounds of the distortion suffice to show that the lens images all pixels.
 
     Where the derivatives are at least 0.7 up to 1.5 times the largest distorted radius, they are so up to the largest
     undistorted one, and the radius changes by half of the bound of their change at the most.
@@ -148,8 +148,8 @@ def imaged_pixels(device: Pinhole, points_px: FloatArray, /) -> NDArray[np.bool_
     """(n,) bool: True for pixels (n, 2) that the lens images by the branch of the distortion that begins at the axis.
 
     The path from the principal point to the pixel is followed in short steps, each by Newton's method. It ends where
-    the determinant of the derivatives is no longer positive: there the lens folds, and no ray arrives beyond. Nor is a
-    pixel imaged whose ray is bent more than by any lens (`_MAX_PINCUSHION`, `_MAX_BELOW_FISHEYE`).
+    the determinant of the derivatives is no longer positive: there the lens folds, and no ray arrives beyond. A pixel
+    is not imaged either if its ray is bent more than by any lens (`_MAX_PINCUSHION`, `_MAX_BELOW_FISHEYE`).
     """
     xd, yd = _distorted(device, points_px)
     x, y = np.zeros_like(xd), np.zeros_like(yd)
@@ -176,10 +176,10 @@ def _grid(size: Size) -> FloatArray:
 
 
 class RigLayout(NamedTuple):
-    """Where the devices of a calibration stand.
+    """Layout of the devices of a calibration.
 
     first, second : names of the two devices that are farthest apart; baseline_mm : their distance. distance_mm :
-    distance from the first device to the place that both look at, by the rays of the middles of their images; None if
+    distance from the first device to the place that both point at, by the rays of the middles of their images; None if
     these rays hardly converge.
     """
 
@@ -192,12 +192,12 @@ class RigLayout(NamedTuple):
         return self.in_unit("mm")
 
     def in_unit(self, unit: LengthUnit) -> str:
-        """Return in words what the layout is if its numbers are in this unit."""
+        """Describe the layout if its numbers are in this unit."""
         scale = MM_PER_UNIT[unit]
-        words = f"{self.first} and {self.second} stand {scale * self.baseline_mm:.3g} mm apart"
+        text = f"{self.first} and {self.second} are {scale * self.baseline_mm:.3g} mm apart"
         if self.distance_mm is None:
-            return words
-        return f"{words} and look at a place {scale * self.distance_mm:.3g} mm away"
+            return text
+        return f"{text} and point at a place {scale * self.distance_mm:.3g} mm away"
 
     def is_of_a_bench(self, unit: LengthUnit) -> bool:
         """Return True if the distances are usual for a bench with its numbers in this unit."""

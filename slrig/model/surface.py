@@ -24,7 +24,7 @@ class MeshAxes(StrEnum):
 
     UPRIGHT : x right, y up, z towards the rig, as viewers and CAD programs have them: (x, -y, -z) of the calibration.
     RIG : those of the calibration, x right, y down, z away from the rig, to compare with other data.
-    ROBOT : those of the base of a robot, where hand-eye calibration says where the rig is in it.
+    ROBOT : those of the base of a robot, in which hand-eye calibration locates the rig.
     """
 
     UPRIGHT = "upright"

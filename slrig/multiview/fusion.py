@@ -479,7 +479,7 @@ def fuse_views(
     points = sharpen_edges(points, means.normals, rough.quads, max_step_mm=_MAX_SHARPENING * voxel)
     faces = _clean_mesh(points, faces, voxel)
     if not len(faces):
-        message = f"expected a surface, found none with voxels of {voxel:g} mm; ask for smaller ones than the object"
+        message = f"expected a surface, found none with voxels of {voxel:g} mm; use voxels smaller than the object"
         raise NothingToReconstructError(message)
     used = used_vertices(faces, len(points))
     numbers = np.cumsum(used, dtype=np.int32) - np.int32(1)

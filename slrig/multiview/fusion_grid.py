@@ -188,7 +188,7 @@ def build_grid(stack: StackedViews, voxel_mm: float) -> Grid:
     if span >= 1 << _AXIS_BITS or len(keys) > _MAX_BRICKS:
         message = (
             f"voxels of {voxel_mm:g} mm are too small for views that reach over {np.ptp(used, axis=0).max():.0f} mm: "
-            f"they take more than {_MAX_BRICKS} bricks of {BRICK}³; ask for larger ones, or remove stray points"
+            f"they take more than {_MAX_BRICKS} bricks of {BRICK}³; use larger voxels, or remove stray points"
         )
         raise InvalidInputError(message)
     steps = np.array([-1, 0, 1])

@@ -43,7 +43,7 @@ MarkerObservations = Mapping[int, MarkerObservation]
 
 @dataclass(frozen=True, slots=True)
 class RejectedMarker:
-    """A marker that one view places elsewhere than the others. off_mm : rms distance of its corners."""
+    """A marker that one view measures elsewhere than the others. off_mm : rms distance of its corners."""
 
     view: int
     marker: int
@@ -265,14 +265,14 @@ def _require_connected(
 
 
 def _initial_poses(views: Sequence[MarkerObservations]) -> FloatArray:
-    """(N, 4, 4): approximate poses, each from the already placed view that it shares most markers with."""
+    """(N, 4, 4): approximate poses, each from the already connected view that it shares most markers with."""
     poses = np.tile(np.eye(4), (len(views), 1, 1))
-    placed, remaining = [0], set(range(1, len(views)))
+    connected, remaining = [0], set(range(1, len(views)))
     while remaining:
-        i, j = max(((i, j) for i in placed for j in sorted(remaining)), key=lambda pair: len(
+        i, j = max(((i, j) for i in connected for j in sorted(remaining)), key=lambda pair: len(
             views[pair[0]].keys() & views[pair[1]].keys()))  # fmt: skip
         poses[j] = poses[i] @ _relative_pose(views[i], views[j])
-        placed.append(j)
+        connected.append(j)
         remaining.remove(j)
     return poses
 

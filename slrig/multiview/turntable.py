@@ -422,7 +422,7 @@ class _TurnedBoard(NamedTuple):
             raise TurntableRefusedError(
                 f"expected a board that turns about one axis, found poses that are off by {axis.rms_mm:.2f} mm rms, "
                 f"'{self.names[worst]}' by {residual[worst]:.2f} mm, the most: the board slipped more than once, or "
-                "was held by hand. Fix it to the turntable, and shoot all poses again"
+                "was hand-held. Fix it to the turntable, and shoot all poses again"
             )
 
     def _corners_at(self, poses: FloatArray) -> FloatArray:

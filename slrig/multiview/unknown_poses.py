@@ -437,7 +437,7 @@ def _score(found: PoseEvidence) -> float:
 
 
 def _candidate_change(each: _CandidatePose, poses: FloatArray) -> FloatArray:
-    """(4, 4): motion of the first view, and of all placed with it, that gives the pair its candidate pose."""
+    """(4, 4): motion of the first view, and of all connected to it, that gives the pair its candidate pose."""
     return np.asarray(poses[each.second] @ each.pose @ np.linalg.inv(poses[each.first]))
 
 

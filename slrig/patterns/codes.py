@@ -149,7 +149,7 @@ def line_number(code_centre_px: ArrayLike, pattern: LineShift) -> NDArray[np.int
     It is correct if the decoded cell is closer than n/2 to the line: with cells of ⌊n/2⌋ a code edge may be off by n/4.
 
     code_centre_px : middle of the decoded cell, cell·i + (cell − 1)/2 − offset (`cell_centre_px`); any shape, finite.
-    Returns integers of the same shape; −1 or `line_count` and above stand for a line that is cut by the projector's
+    Returns integers of the same shape; −1 or `line_count` and above mean a line that is cut by the projector's
     border or outside.
 
     >>> from slrig.model import Axis, LineShift

@@ -95,7 +95,7 @@ def scan_patterns(
     by its inverse. coloured_light : add white in red, green and blue, each between two of the last code frames, so that
     a stale frame cannot pass for one of them or for the next.
 
-    Raises PatternError if the code cannot tell the lines of one frame apart, steps do not divide the period, or a
+    Raises PatternError if the code cannot distinguish the lines of one frame, steps do not divide the period, or a
     pattern does not fit the projector.
 
     >>> options = dict(line_width_px=None, gray_cell_px=None, gray_offset_px=0, rows=False)
@@ -124,10 +124,10 @@ def scan_patterns(
         lines = [LineShift(axis, shift, period_px, width_px) for shift in shifts]
         first = list(chain.from_iterable(diagnostic_line_pairs(lines)))
         code = _gray_patterns(axis, size.along(axis), cell_px, gray_offset_px, inverses=inverses)
-        telling = diagnostic_bits(code[0].bits)
-        body += [each for each in code if each.bit in telling]
+        diagnostic = diagnostic_bits(code[0].bits)
+        body += [each for each in code if each.bit in diagnostic]
         body += [*first, *(line for line in lines if line not in first)] if not inverses else lines
-        body += [each for each in code if each.bit not in telling]
+        body += [each for each in code if each.bit not in diagnostic]
     if coloured_light:
         _insert_lights(body)
     return (*reference, *body, *reference[:closing])

@@ -124,7 +124,7 @@ def require_numbered(sines: Sequence[Sine], size: Size) -> None:
     periods = ", ".join(f"{each:g}" for each in sorted({each.period_px for each in sines}))
     message = (
         f"sinusoids of {periods} px repeat every {repeat_px:g} {axis}s, the projector has {extent_px} ({size}): they "
-        "cannot tell the periods apart by themselves. Add the frames of a Gray code, or of periods that do not repeat "
+        "alone do not distinguish the periods. Add the frames of a Gray code, or of periods that do not repeat "
         f"within {extent_px}, one as long as the projector for example; or correct the periods"
     )
     raise PatternError(message)

@@ -255,7 +255,7 @@ def test_the_unit_of_a_calibration_is_asked_and_taken(tmp_path: Path) -> None:
     opencv_file(folder / "calibration.yml", SCAN3D, [lens, straight, lens, straight, np.eye(3), shift, np.eye(3)])
     result = run(folder, "--output", tmp_path / "bundle", "--projector", "200x160", "--format", "opencv")
     assert result.exit_code == 2
-    assert "stand 0.1 mm apart (--unit mm). Metres?" in " ".join(result.stderr.split())
+    assert "are 0.1 mm apart (--unit mm). Metres?" in " ".join(result.stderr.split())
     calibration = read_bundle(imported(folder, tmp_path / "bundle", "--unit", "m", "--format", "opencv")).calibration
     assert calibration is not None
     assert calibration.projector is not None

@@ -78,7 +78,7 @@ def test_a_projector_shows_what_is_loaded() -> None:
     state.require_size(sequence, SIZE)
     with pytest.raises(UnsupportedByDeviceError, match="the lamp shows 64 x 40, the sequence was made for 64 x 48"):
         state.require_size(sequence, Size(64, 40))
-    with pytest.raises(DeviceStateError, match="show pattern 0, no sequence is loaded"):
+    with pytest.raises(DeviceStateError, match="show pattern 0: no sequence is loaded"):
         state.require_pattern(0)
     state.loaded = sequence
     assert state.require_pattern(1) is sequence

@@ -180,10 +180,10 @@ def program_file(path: Path, keys: tuple[str, ...] = OPENCV_KEYS, **changes: Any
 @pytest.mark.parametrize(
     ("scale", "words"),
     [
-        (1e-3, r"stand 0.243 mm apart .*Metres\? Then .* 243 mm apart .*--unit m\)"),
-        (0.1, r"stand 24.3 mm apart .*Centimetres\? .*--unit cm\)"),
-        (1 / 25.4, r"stand 9.55 mm apart .*Inches\? .*--unit inch\)"),
-        (1e3, r"stand 2.43e\+05 mm apart .*State the unit"),
+        (1e-3, r"are 0.243 mm apart .*Metres\? Then .* 243 mm apart .*--unit m\)"),
+        (0.1, r"are 24.3 mm apart .*Centimetres\? .*--unit cm\)"),
+        (1 / 25.4, r"are 9.55 mm apart .*Inches\? .*--unit inch\)"),
+        (1e3, r"are 2.43e\+05 mm apart .*State the unit"),
     ],
 )
 def test_a_file_without_unit_is_asked_for_it_where_it_makes_no_bench(tmp_path: Path, scale: float, words: str) -> None:

@@ -251,7 +251,7 @@ def test_calibrations_are_imported_compared_and_refused(calibrating: TestClient,
     write_calibration(path, replace(in_metres, projector=there))
     answer = client.post("/calibration/import", content=path.read_bytes(), headers=JSON)
     assert answer.status_code == 422
-    assert "stand 0.1 mm apart. Metres?" in answer.json()["detail"]
+    assert "are 0.1 mm apart. Metres?" in answer.json()["detail"]
     strange = client.post("/calibration/import", content=b"x", headers={"Content-Type": "text/plain"})
     assert (strange.status_code, strange.headers["content-type"]) == (415, "application/problem+json")
     too_large = (413, "/problems/content-too-large")
