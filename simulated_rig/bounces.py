@@ -1,9 +1,9 @@
 """Light that reaches a camera by way of two surfaces: mirrored once, or scattered once between diffuse surfaces.
 
-Mirrored light. A sample of the camera has two kinds of paths beside its direct one: camera, mirror, lit surface; and
-camera, surface, flat mirror, projector, by which the mirror image of the projector lights the surface. Curved mirrors
-are traced in the first way only. Rough mirrors spread the light over the projector's image: to first order, a tilt of
-the mirror displaces the path there, and slopes of a Gaussian distribution blur the pattern.
+Mirrored light. A sample of the camera has two kinds of paths in addition to its direct one: camera, mirror, lit
+surface; and camera, surface, flat mirror, projector, by which the mirror image of the projector lights the surface.
+Curved mirrors are traced in the first way only. Rough mirrors spread the light over the projector's image: to first
+order, a tilt of the mirror displaces the path there, and slopes of a Gaussian distribution blur the pattern.
 
 Scattered light. The projector's image is divided into pixels, each of which is a small lamp where it meets a surface.
 At a point p the light of all of them is Σ ρ E F, with the albedo ρ, the light E and the form factor F from p of the
@@ -49,7 +49,7 @@ _SAME_NORMAL = 0.95
 _CHUNK = 1024
 _VISIBLE_CELL_PX = 8
 _TESTED_NODES = 200
-_FEW = 1e-3  # share of pairs that something stands between: less is rounding at edges
+_FEW = 1e-3  # share of pairs with something between them: less is rounding at edges
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,7 @@ class AxisLight:
 
 @dataclass(frozen=True, slots=True)
 class Interreflection:
-    """Scattered light at N points, and which of them stand for each camera pixel.
+    """Scattered light at N points, and those that represent each camera pixel.
 
     node : (H, W, 4) int32; share : (H, W, 4) float32, 0 where the pixel has none.
     """
@@ -253,7 +253,7 @@ def _trace_mirrors(scene: _MirrorScene, per_axis: int, seed: int | None, workers
             u, v, camera, scene.projector, surface, scene.rays,
             working_distance_mm=scene.working_distance_mm, footprint_px=1 / per_axis,
         )  # fmt: skip
-        found = [_seen_in_mirrors(scene, hits), *(_lit_by_mirror(scene, hits, plane) for plane in planes)]
+        found = [_mirrored_surfaces(scene, hits), *(_lit_by_mirror(scene, hits, plane) for plane in planes)]
         out = []
         for index, position, spread, weight in found:
             light = weight * vignetting(position[:, 0], position[:, 1], scene.projector, scene.fall_off) / count
@@ -297,7 +297,7 @@ def _spread_px(normals: FloatArray, roughness: FloatArray, tilted: Callable[[Flo
     return np.sqrt(spread)
 
 
-def _seen_in_mirrors(scene: _MirrorScene, hits: Hits) -> _Found:
+def _mirrored_surfaces(scene: _MirrorScene, hits: Hits) -> _Found:
     """Paths camera, mirror, lit surface."""
     surface = scene.surface
     own = surface.part[np.maximum(hits.triangle, 0)]
@@ -306,15 +306,15 @@ def _seen_in_mirrors(scene: _MirrorScene, hits: Hits) -> _Found:
     points, normals = hits.points_mm[index], hits.normals[index]
     towards = _unit(points - scene.camera.centre_mm)
     directions = _reflect(towards, normals)
-    triangle, seen, seen_normals = transport.find_points(
+    triangle, mirrored, mirrored_normals = transport.find_points(
         points, directions, surface, scene.rays, starts_mm=points + _OFFSET_MM * normals
     )
     none = np.zeros(len(index))
     pigments = transport.print_reflectance(
-        seen, seen_normals, triangle, none, none, scene.camera, surface, footprint_px=0.0
+        mirrored, mirrored_normals, triangle, none, none, scene.camera, surface, footprint_px=0.0
     )
     lit = transport.light_points(
-        seen, seen_normals, directions, triangle, pigments, scene.projector, surface, scene.rays,
+        mirrored, mirrored_normals, directions, triangle, pigments, scene.projector, surface, scene.rays,
         working_distance_mm=scene.working_distance_mm,
     )  # fmt: skip
     kept = np.flatnonzero((lit.weight > 0) & np.isfinite(lit.column_px))
@@ -322,8 +322,8 @@ def _seen_in_mirrors(scene: _MirrorScene, hits: Hits) -> _Found:
 
     def tilted(changed: FloatArray) -> FloatArray:
         moved = _reflect(towards[kept], changed)
-        height = ((seen[kept] - points[kept]) * seen_normals[kept]).sum(axis=1)
-        at = points[kept] + moved * (height / (moved * seen_normals[kept]).sum(axis=1))[:, None]
+        height = ((mirrored[kept] - points[kept]) * mirrored_normals[kept]).sum(axis=1)
+        at = points[kept] + moved * (height / (moved * mirrored_normals[kept]).sum(axis=1))[:, None]
         return image_positions(at, scene.projector)
 
     spread = _spread_px(normals[kept], surface.material[own[index], 7], tilted)
@@ -343,7 +343,7 @@ def _lit_by_mirror(scene: _MirrorScene, hits: Hits, plane: _Plane) -> _Found:
     points, normals = hits.points_mm[index], hits.normals[index]
 
     def crossing(lamps: FloatArray) -> FloatArray:
-        """Where rays from the points to mirror images of the lamp, (n, 3) or (3,), cross the mirror."""
+        """Points at which rays from the points to mirror images of the lamp, (n, 3) or (3,), cross the mirror."""
         height, depth = plane.height_mm(points), plane.height_mm(lamps)
         return np.asarray(points + (lamps - points) * (height / (height - depth))[:, None])
 
@@ -428,7 +428,7 @@ def _add_mirrored(
 
 
 class _Senders:
-    """Where the pixels of the projector meet the scene, as small lamps, and blocks of them.
+    """Points of the scene lit by the pixels of the projector, as small lamps, and blocks of them.
 
     Entries of all levels follow each other, level 0 first; level l has (height[l], width[l]) blocks from offset[l] on.
     position : (n, 3) float64, mean by power; facing : (n, 3), mean of the normals; power : (n,), ρ Φ / π, with the
@@ -555,10 +555,10 @@ def _trace_scattered(
 def _receivers(
     camera: Pinhole, surface: SceneSurface, rays: RayCaster
 ) -> tuple[tuple[FloatArray, FloatArray, NDArray[np.intp], IntArray], NDArray[np.int32], Float32Array]:
-    """Return the points whose light is summed, and which of them stand for each pixel.
+    """Return the points whose light is summed, and those that represent each pixel.
 
     First ((N, 3) points, (N, 3) normals, (N,) pixel, (N,) part), then node and share as in `Interreflection`. A pixel
-    is interpolated between the points of a coarse grid if all lie on the same smooth surface, and else has its own.
+    is interpolated between the points of a coarse grid if all are on the same smooth surface, and else has its own.
     """
     shape = rows, columns = camera.size.shape
     points, normals = np.zeros((*shape, 3)), np.zeros((*shape, 3))
@@ -623,8 +623,8 @@ def _visible_blocks(
 ) -> tuple[NDArray[np.bool_], IntArray]:
     """Return which of the largest blocks points see, (groups, blocks) bool, and the group of each point, (N,) int32.
 
-    Points of one part within a small cell of the image see alike. Where nothing stands between any, there is one group
-    that sees all.
+    Points of one part within a small cell of the image see the same blocks. Where nothing is between any, there is one
+    group that sees all.
     """
     blocks = np.flatnonzero(senders.representative >= 0)
     everything = np.ones((1, len(senders.representative)), bool)
@@ -637,12 +637,12 @@ def _visible_blocks(
             faces = (to @ normals[k] > 0) & ((to * senders.facing[lamps]).sum(axis=1) < 0)
             clear = np.ones(len(lamps), bool)
             own_start = points[k] + _OFFSET_MM * normals[k]
-            asked = np.flatnonzero(faces)
-            if len(asked):
-                directions = np.ascontiguousarray(to[asked] / distance[asked, None])
+            facing = np.flatnonzero(faces)
+            if len(facing):
+                directions = np.ascontiguousarray(to[facing] / distance[facing, None])
                 _, met, _ = transport.find_points(own_start[None], directions, surface, rays)
                 reach = np.linalg.norm(met - own_start, axis=1)
-                clear[asked] = ~(reach < distance[asked] - max(SHADOW_BIAS_MM, 0.001 * float(distance.max())))
+                clear[facing] = ~(reach < distance[facing] - max(SHADOW_BIAS_MM, 0.001 * float(distance.max())))
             yield clear
 
     if len(points) == 0 or len(blocks) == 0:

@@ -276,7 +276,7 @@ class SimulatedHead:
 
     @property
     def calibration(self) -> Calibration | None:
-        """See `ScannerHead`. None if the options say so."""
+        """See `ScannerHead`. None if the options leave it out."""
         return self._calibration if self._carries_calibration else None
 
     @property
@@ -287,11 +287,11 @@ class SimulatedHead:
     def prepare(self) -> None:
         """Compile kernels and trace the light of the current scene, reporting progress."""
         with (
-            _repeating(progress_reporter()) as tell,
-            report_compilations(lambda kernel: tell(f"preparing kernels, first time only: {kernel}")),
+            _repeating(progress_reporter()) as report,
+            report_compilations(lambda kernel: report(f"preparing kernels, first time only: {kernel}")),
         ):
             for name, view in self._views.items():
-                view.prepare(report_progress=partial(_report_tracing, tell, name))
+                view.prepare(report_progress=partial(_report_tracing, report, name))
 
     @property
     def positioner(self) -> Positioner | None:
@@ -319,7 +319,7 @@ def _repeating(report: Callable[[str], None]) -> Iterator[Callable[[str], None]]
     """
     last, over = [""], threading.Event()
 
-    def tell(text: str) -> None:
+    def report_and_keep(text: str) -> None:
         last[0] = text
         report(text)
 
@@ -329,13 +329,13 @@ def _repeating(report: Callable[[str], None]) -> Iterator[Callable[[str], None]]
 
     threading.Thread(target=repeat, name="slrig-preparing", daemon=True).start()
     try:
-        yield tell
+        yield report_and_keep
     finally:
         over.set()
 
 
-def _report_tracing(tell: Callable[[str], None], camera: str, share: float) -> None:
-    tell(f"tracing light for camera '{camera}', {share:.0%}")
+def _report_tracing(report: Callable[[str], None], camera: str, share: float) -> None:
+    report(f"tracing light for camera '{camera}', {share:.0%}")
 
 
 def open_head(options: Mapping[str, object], folder: Path) -> ScannerHead:

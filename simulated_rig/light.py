@@ -38,7 +38,7 @@ _MAX_CHANGES = 256
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """How a projector turns grey values into light: leak + (1 - leak) * (value / 255) ^ gamma, and its blur.
+    """Light of a projector by grey value: leak + (1 - leak) * (value / 255) ^ gamma, and its blur.
 
     `blur_px` is the standard deviation of the lens's Gaussian blur of the square pixels. `signal_blur_px` blurs the
     grey values before gamma, as a scaler or an analogue cable does; without it gamma has no effect on black-and-white

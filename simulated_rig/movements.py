@@ -1,7 +1,7 @@
 """Movements of the simulated rig: object poses, turntable, bumped and drifting devices.
 
 A generated series of poses follows good practice with a calibration board: tilted about all axes, near and far, rotated
-in its plane, and placed in the centre, the corners and at the sides of the images.
+in its plane, and in the centre, the corners and at the sides of the images.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def apply_pose_offset(device: Pinhole, push: PoseOffset, *, share: float = 1.0) 
 
 
 class TurntableOptions(Strict, use_attribute_docstrings=True):
-    """Options of the turntable: `[head.turntable]`. At 0° the objects are placed as in the scene file."""
+    """Options of the turntable: `[head.turntable]`. At 0° the objects are as in the scene file."""
 
     point_mm: Triple
     """A point on the axis."""
@@ -187,7 +187,7 @@ class SimulatedTurntable(TurntableBase):
 
     @property
     def opened_at_deg(self) -> float | None:
-        """See `Turntable`. Objects start as placed in the scene file."""
+        """See `Turntable`. Objects start as in the scene file."""
         return None
 
     def turn(self, angle_deg: float) -> None:
@@ -339,7 +339,7 @@ def _rounded_pose(number: int, middle: FloatArray, rotation: FloatArray) -> Scri
 def _free_distance(
     corners: FloatArray, sideways: FloatArray, fields: Sequence[tuple[Pinhole, float]], edge_px: float
 ) -> float:
-    """How many times `sideways`, mm, a board can be moved until it touches a border."""
+    """Number of times that a board can be moved by `sideways`, mm, until it touches a border."""
     low, high = 0.0, _FARTHEST_MM
     for _ in range(_HALVINGS):
         half = (low + high) / 2

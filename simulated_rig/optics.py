@@ -130,10 +130,10 @@ def field_radius(device: Pinhole) -> float:
 
 
 def look_at(position_mm: FloatArray, target_mm: FloatArray, down: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return (rotation, translation_mm), world to device, of a device that looks at a target.
+    """Return (rotation, translation_mm), world to device, of a device that points at a target.
 
     `down` is the world direction that points down in the image, as nearly as the viewing direction allows. Raises
-    ValueError when position and target coincide or the device looks along `down`.
+    ValueError when position and target coincide or the device points along `down`.
     """
     forward = target_mm - position_mm
     distance = float(np.linalg.norm(forward))
@@ -141,7 +141,7 @@ def look_at(position_mm: FloatArray, target_mm: FloatArray, down: FloatArray) ->
     spread = float(np.linalg.norm(right))
     if distance == 0.0 or spread <= 1e-9 * distance * float(np.linalg.norm(down)):
         message = (
-            f"a device at {position_mm.tolist()} cannot look at {target_mm.tolist()} with {down.tolist()} pointing "
+            f"a device at {position_mm.tolist()} cannot point at {target_mm.tolist()} with {down.tolist()} pointing "
             "down: the two directions must differ"
         )
         raise ValueError(message)

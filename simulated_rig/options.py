@@ -76,9 +76,9 @@ class DeviceOptions(Strict, use_attribute_docstrings=True):
 
     @model_validator(mode="after")
     def _check_pose(self) -> DeviceOptions:
-        look = (self.position_mm is not None, self.target_mm is not None)
+        target = (self.position_mm is not None, self.target_mm is not None)
         matrix = (self.rotation is not None, self.translation_mm is not None)
-        if not ((all(look) and not any(matrix)) or (all(matrix) and not any(look))):
+        if not ((all(target) and not any(matrix)) or (all(matrix) and not any(target))):
             message = "give a pose as position_mm and target_mm, or as rotation and translation_mm, not both"
             raise ValueError(message)
         try:

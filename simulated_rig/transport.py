@@ -1,9 +1,9 @@
-"""Ray-traced light paths projector -> surface -> camera: where each camera sample is lit from, and how strongly.
+"""Ray-traced light paths projector -> surface -> camera: the projector position and strength of each sample's light.
 
 Each state of the world is traced once; each pattern is then a table look-up (`simulated_rig.light`). Light from one
 surface to another is traced by `simulated_rig.bounces`.
 
-Prints are averaged exactly over each sample. A sample stands for a cell of its pixel; the cell's rays meet the sheet in
+Prints are averaged exactly over each sample. A sample represents a cell of its pixel; the cell's rays meet the sheet in
 a small quadrilateral, whose dark part follows from clipping it at the lines of the print. Edges are therefore
 independent of the sample positions.
 """
@@ -441,7 +441,7 @@ def trace_rays(
 
     The weight is the Lambert and Phong light times (working distance / distance to the projector)²: 1 for a white
     diffuser at the working distance that faces the projector. footprint_px : side of the square of the image that each
-    ray stands for, over which prints are averaged; 0 evaluates prints at the point.
+    ray represents, over which prints are averaged; 0 evaluates prints at the point.
     """
     directions = world_directions(u, v, lens_array(camera), camera.rotation)
     triangle, points, normals = find_points(camera.centre_mm[None], directions, surface, rays)
