@@ -1,4 +1,4 @@
-"""Loading of the libraries that drivers need: whatever goes wrong ends in one error that says how to install them."""
+"""Loading of the libraries that drivers need: every failure becomes one error that states how to install them."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from slrig.errors import LibraryMissingError
 
 @contextmanager
 def loading(driver: str, library: str, *, install: str, packages: str, where: str = "") -> Iterator[None]:
-    """Turn what imports in the block raise into LibraryMissingError.
+    """Turn any exception of the imports in the block into LibraryMissingError.
 
     A library that is installed may raise anything: ValueError ("numpy.dtype size changed") and AttributeError where it
     was built for another version of numpy or glib, ImportError and OSError where a library beneath it is missing.
 
     driver : its name in rig files. library : its name, for the message. install : the command that installs it.
-    packages : names by which pip builds it anew. where : what to heed when the command is run.
+    packages : names by which pip builds it again. where : remark on how to run the command.
     """
     try:
         yield

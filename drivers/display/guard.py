@@ -27,7 +27,7 @@ class GuardProcess:
 
     def __init__(self, module: str, task: str, output: str, handles: Sequence[int] = ()) -> None:
         self._lock = threading.Lock()
-        # Not ours: it outlives this process, and whoever reads our errors to their end would wait for it.
+        # Not ours: the guard outlives this process, and a reader of our errors to their end would wait for it.
         with tempfile.TemporaryFile() as errors:
             self._process = subprocess.Popen(  # noqa: S603 - our own program
                 [sys.executable, "-m", module, task],

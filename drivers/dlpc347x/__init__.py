@@ -18,7 +18,7 @@ the time at which a video picture is on the mirrors cannot be known.
 `play` shows the loaded sequence with a pulse on TRIG_OUT_2 per pattern, and this program stops the engine at its end.
 It takes sequences of one axis: the time from one set of its flash to the next is not documented. `show` lights one
 pattern repeatedly, 7.6 ms of 7.8, the longest documented light: short exposures may lose 0.2 ms of it. A sequence has a
-counted number of repeats, so it ends by itself: 2 s after the death of its host for `show`, after twice its length at
+counted number of repeats, so it ends on its own: 2 s after the end of its host for `show`, after twice its length at
 most for `play`. Dark means: every LED off, read back, and the sequence stopped.
 
 LED current. The number that "directly controls the LED current" (TI's header) is set as a fraction of the maximum in

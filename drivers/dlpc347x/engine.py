@@ -270,7 +270,7 @@ class Dlpc347xEngine:
             raise DeviceError(message + "; switch it off and on, and write its flash: slrig patterns RIG")
 
     def switch_leds(self, *, by_sequence: bool) -> None:
-        """Let the sequence switch the LEDs, or switch them all off; verify by reading back."""
+        """Have the sequence switch the LEDs, or switch them all off; verify by reading back."""
         self.settle(Dlpc347xCommand.LED_ENABLE, bytes([7 if by_sequence else 0]))
 
     def restart(self) -> None:

@@ -128,7 +128,7 @@ def locate_patterns(
     sequence: PatternSequence, lines: LineEncoder, available: Mapping[PatternLine, tuple[FlashedLine, ...]]
 ) -> tuple[FlashedLine, ...]:
     """Return the location of each pattern, in a single set if possible. Raises UnsupportedByDeviceError if the flash
-    lacks patterns; the message says what to do.
+    lacks patterns; the message contains the remedy.
     """
     found = [
         {place.set: place for line in lines.encode(sequence, index) for place in reversed(available.get(line, ()))}

@@ -181,7 +181,7 @@ class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
         engine.switch_leds(by_sequence=False)
         number = engine.controller()
         if number not in MIRRORS:
-            message = f"{engine.name} is controller {number:#04x}, this driver knows the DLPC3470 and the DLPC3478"
+            message = f"{engine.name} is controller {number:#04x}, this driver supports the DLPC3470 and the DLPC3478"
             two = "; the DLPC3479 is not supported, because TI's sources differ on its flash format"
             raise UnsupportedByDeviceError(message + (two if number == 0x0C else ""))
         name, mirrors = MIRRORS[number]

@@ -15,7 +15,7 @@ column. A calibration for 912 x 1140 pixels accounts for this: its fy is twice i
 
 Sequences. Commands are sent in the order stop, set, validate, start, with the waits of TI's programs
 (`drivers.pattern_engine.patience`). `play` shows the loaded sequence once, with a pulse on TRIG_OUT_1 per pattern.
-`show` plays a sequence of one pattern, which ends by itself within 2 s; while this program lives, it restarts it once a
+`show` plays a sequence of one pattern, which ends on its own within 2 s; while this program runs, it restarts it once a
 second, with the LEDs off meanwhile, for at most `hold_s`. Dark means: sequence stopped and every LED off.
 
 Tables. All patterns of a sequence have the same times, so the table without times of their own is used (trigger mode
@@ -25,7 +25,7 @@ Tables. All patterns of a sequence have the same times, so the table without tim
 Speed. A show takes a dozen commands of some 3 ms, 20 ms of waits if the table changes, and the loading time of a
 picture from the flash: 200 ms at worst, less for simple pictures; TI's program shows it. The engine's buffer holds two
 pictures, and a running sequence repeats from there without loading (DLPU011, "Pattern Sequence Background"). It is not
-documented whether this holds for a start after a stop; it is assumed to load, unless the rig file says otherwise
+documented whether this holds for a start after a stop; it is assumed to load, unless the rig file states otherwise
 (`image_kept_s`).
 
 LED current. TI's own sources for the LightCrafter 4500 (lcr4500.cpp in the DLP SDK) send 255 minus the current; the

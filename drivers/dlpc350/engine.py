@@ -96,8 +96,8 @@ VALIDATION_FAULTS = {
 _BUSY = 0x80
 _STOP_AGAIN_S = 0.1
 PAUSE_S = 0.01
-"""From the command to validate until the first look at its result, and from the result until the start. The register of
-the result says "not busy" before the engine begins."""
+"""From the command to validate until its result is first read, and from the result until the start. The register of
+the result reads "not busy" before the engine begins."""
 _FIRST_PAUSE_S = 0.1
 """The first of these after the engine was opened."""
 _EDGE_NS = 107.2

@@ -140,7 +140,7 @@ class FlashContents:
 
     def places(self, sequence: PatternSequence) -> tuple[FlashedPlane, ...]:
         """Return the location of each pattern, with as few changes of picture as possible. Raises
-        UnsupportedByDeviceError if the flash lacks patterns; the message says what to do.
+        UnsupportedByDeviceError if the flash lacks patterns; the message contains the remedy.
         """
         found = [self._candidates(pattern_plane(sequence, index)) for index in range(len(sequence))]
         missing = [index for index, candidates in enumerate(found) if not candidates]
@@ -177,8 +177,8 @@ class FlashContents:
         written = write_pictures(self.folder / EXPORT_FOLDER, sequence, self.pictures)
         return (
             f"the pictures to flash are in {written.folder}: add them to the firmware with TI's LightCrafter 4500 "
-            f'program, in the order of their numbers, with the firmware tag "{written.tag}", upload it, and let '
-            "patterns in the [projector] table of the rig file name that folder"
+            f'program, in the order of their numbers, with the firmware tag "{written.tag}", upload it, and set '
+            "patterns in the [projector] table of the rig file to that folder"
         )
 
 
@@ -256,7 +256,7 @@ def write_pictures(folder: Path, sequence: PatternSequence, others: Sequence[Fla
     if len(pictures) > MAX_IMAGES:
         message = (
             f"{len(made)} pictures in addition to the {len(others)} in the flash exceed its limit of {MAX_IMAGES}; "
-            "start again: let patterns in the rig file name an empty folder"
+            "start again: set patterns in the rig file to an empty folder"
         )
         raise UnsupportedByDeviceError(message)
     together = hashlib.sha256(b"".join(picture.content for picture in pictures)).hexdigest()

@@ -95,7 +95,7 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
         self._state.require_pattern(index)
         place = self._places[index]
         load_s = self._options.load_s(same_picture=self._shown_picture == place.image)
-        # The sequence ends by itself; it may have to load a picture first.
+        # The sequence ends on its own; it may have to load a picture first.
         alone_us = round((MAX_UNATTENDED_S - self._options.image_load_s) * 1e6)
         if self.is_polarity_unknown:
             timing, count = DIM_TIMING, min(alone_us // DIM_TIMING.period_us, MAX_PATTERNS)
@@ -185,7 +185,7 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
         tag = self._engine.firmware_tag()
         if flash.tag is not None and tag != flash.tag:
             message = (
-                f'{self._engine.name}: the list in {flash.folder} is of a flash tagged "{flash.tag}", the engine says '
+                f'{self._engine.name}: the list in {flash.folder} is of a flash tagged "{flash.tag}", the engine has '
                 f'"{tag}": it may hold other pictures; flash those of that folder with TI\'s LightCrafter 4500 program '
                 "and give that tag, or set patterns in the rig file to the folder of the flashed pictures"
             )

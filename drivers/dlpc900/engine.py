@@ -163,7 +163,7 @@ SECOND_READY, INCOMPATIBLE = 16, 2
 """Bits of the hardware status (DLPU018 table 2-2)."""
 ERRORS = {
     2: "a device failed",
-    3: "it does not know the command",
+    3: "the command is unknown",
     4: "controller and mirrors do not fit",
     5: "not in this mode",
     6: "a parameter is invalid",
@@ -274,7 +274,7 @@ class Dlpc900Engine(UsbEngine):
             return Dlpc900Mirrors(number)
         except ValueError as error:
             known = ", ".join(mirrors.name for mirrors in Dlpc900Mirrors)
-            message = f"{self.name} has mirrors of type {number}, this driver knows {known}; use one of these"
+            message = f"{self.name} has mirrors of type {number}, this driver supports {known}; use one of these"
             raise UnsupportedByDeviceError(message) from error
 
     def set_trigger_out(self, *, active_low: bool, delay_us: int) -> None:
@@ -310,8 +310,8 @@ class Dlpc900Engine(UsbEngine):
 
     def wait_until_stopped(self) -> None:
         """See `UsbEngine`. 0x1A24 cannot be read here, the guide names the status instead (DLPU018, "Pattern Display
-        Start/Stop"). Goes on if that does not change, and waits no more then: what it says without a sequence is not
-        documented. What a running sequence refuses is an error with the engine's own reason.
+        Start/Stop"). Continues if that does not change, and waits no more then: the status without a sequence is not
+        documented. Commands that a running sequence refuses raise with the engine's own reason.
         """
         if self._reports_stop:
             self._reports_stop = ask_until(

@@ -102,7 +102,7 @@ def translate_aravis_errors(name: str, doing: str) -> Iterator[None]:
 def _slrig_error(aravis: Any, name: str, doing: str, cause: Any) -> DeviceError:
     what = f"camera '{name}', {doing}: {cause.message}"
     if cause.domain == "arv-gc-error-quark":
-        return UnsupportedByDeviceError(f"{what}; look up what the camera offers in its manual, and ask for that")
+        return UnsupportedByDeviceError(f"{what}; request what the camera's manual offers")
     if cause.domain != "arv-device-error-quark":
         return DeviceError(f"{what}; check the camera's cable and power, and try again")
     codes = aravis.DeviceError
@@ -112,7 +112,7 @@ def _slrig_error(aravis: Any, name: str, doing: str, cause: Any) -> DeviceError:
         return DeviceBusyError(f"{what}; another program controls the camera: close that program")
     if cause.code in {int(codes.PROTOCOL_ERROR_BUSY), int(codes.TRANSFER_ERROR), int(codes.UNKNOWN)}:
         return DeviceError(f"{what}; check the camera's cable and load, and try again")
-    return UnsupportedByDeviceError(f"{what}; look up what the camera offers in its manual, and ask for that")
+    return UnsupportedByDeviceError(f"{what}; request what the camera's manual offers")
 
 
 class AravisConnection(GenICamConnection):

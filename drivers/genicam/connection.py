@@ -220,7 +220,7 @@ class Features:
             step = camera.get_integer_increment(feature)
         if not least <= value <= most or (step > 1 and (value - least) % step):
             steps = f" in steps of {step}" if step > 1 else ""
-            raise self._refusal(feature, value, f"it takes {least} to {most}{steps}", "ask for such a value")
+            raise self._refusal(feature, value, f"it takes {least} to {most}{steps}", "request such a value")
         with self._access(feature) as camera:
             camera.set_integer(feature, value)
         self._require_equal(feature, value, self.integer(feature))
@@ -283,16 +283,16 @@ class Features:
         with self._access(feature) as camera:
             least, most = camera.get_float_bounds(feature)
         if not least <= value <= most:
-            raise self._refusal(feature, value, f"it takes {least:g} to {most:g}", "ask for such a value")
+            raise self._refusal(feature, value, f"it takes {least:g} to {most:g}", "request such a value")
         with self._access(feature) as camera:
             camera.set_float(feature, value)
             got = float(camera.get_float(feature))
         if differs(got, value):
-            raise self._refusal(feature, value, f"it gives {got:g}", "ask for a value that it can give")
+            raise self._refusal(feature, value, f"it gives {got:g}", "request a value that it can give")
 
     def _require_equal(self, feature: str, requested: object, got: object) -> None:
         if got != requested:
-            raise self._refusal(feature, requested, f"it gives {got}", "ask for a value that it can give")
+            raise self._refusal(feature, requested, f"it gives {got}", "request a value that it can give")
 
     def _refusal(self, feature: str, requested: object, found: str, remedy: str) -> UnsupportedByDeviceError:
         return UnsupportedByDeviceError(f"camera '{self._name}': requested {feature} {requested}, {found}; {remedy}")

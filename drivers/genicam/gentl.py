@@ -71,7 +71,7 @@ def translate_gentl_errors(name: str, doing: str) -> Iterator[None]:
         if isinstance(cause, tuple(getattr(gentl, each) for each in _BUSY)):
             raise DeviceBusyError(f"{what}; another program controls the camera: close that program") from cause
         if isinstance(cause, tuple(getattr(genapi, each) for each in _REFUSED)):
-            message = f"{what}; look up what the camera offers in its manual, and ask for that"
+            message = f"{what}; request what the camera's manual offers"
             raise UnsupportedByDeviceError(message) from cause
         if isinstance(cause, (genapi.TimeoutException, *(getattr(gentl, each) for each in _GONE))):
             message = f"{what}; the camera does not answer: check its cable and power, and open it again"

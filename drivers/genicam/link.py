@@ -1,4 +1,4 @@
-"""What limits the frames of a camera on their way: memory of the USB subsystem, packets, and rights of the user."""
+"""Limits of a camera's link: memory of the USB subsystem, packets, and rights of the user."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _USB3_VISION = ("ef", "05")
 
 
 def link_notes(connection: GenICamConnection) -> list[str]:
-    """Return notes on what may lose or delay frames of the present size."""
+    """Return notes on limits that may lose or delay frames of the present size."""
     features = connection.features
     with connection.access("reading the size of a frame") as camera:
         frame_bytes = int(camera.get_payload())
@@ -40,11 +40,11 @@ def link_notes(connection: GenICamConnection) -> list[str]:
         if packet_bytes < _SMALL_PACKET_BYTES:
             notes.append(
                 f"its packets have {packet_bytes} bytes, {-(-frame_bytes // packet_bytes)} a frame: with so many the "
-                "computer may lose some; let its network card take long ones (sudo ip link set dev CARD mtu 9000)"
+                "computer may lose some; allow long ones on its network card (sudo ip link set dev CARD mtu 9000)"
             )
         if 0 < kept_bytes < frame_bytes:
             notes.append(
-                f"the system keeps {kept_bytes} bytes of what arrives, less than its frame of {frame_bytes}: packets "
+                f"the system buffers {kept_bytes} bytes, less than its frame of {frame_bytes}: packets "
                 f"may be lost; run: sudo sysctl -w net.core.rmem_max={max(2 * frame_bytes, 1 << 25)}"
             )
     limit = "DeviceLinkThroughputLimit"

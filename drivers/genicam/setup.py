@@ -41,8 +41,8 @@ _NEUTRAL: tuple[tuple[tuple[str, ...], int], ...] = (
     (("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled", "AcquisitionFrameRateMode"), 0),
     (("TriggerDelay", "TriggerDelayAbs"), 0),
 )
-"""What another program or a user set may have left on: features that do the same, of which the first that the camera
-takes is switched off; and the number that is neutral where it is a number (the nearest that it takes)."""
+"""Features that another program or a user set may have left on: groups of equal effect, of which the first that the
+camera takes is switched off; and the number that is neutral where it is a number (the nearest that it takes)."""
 
 _DEBOUNCERS = ("LineDebouncerTime", "LineDebouncerTimeAbs", "LineFilterWidth")
 
@@ -186,8 +186,8 @@ def _choose_trigger_line(connection: GenICamConnection, options: GenICamCameraOp
 
 
 def set_trigger(connection: GenICamConnection, source: str | None, options: GenICamCameraOptions) -> None:
-    """Let `source` start every exposure; None lets the camera run freely. Raises UnsupportedByDeviceError if it is not
-    accepted.
+    """Set `source` as the start of every exposure; None: the camera runs freely. Raises UnsupportedByDeviceError if it
+    is not accepted.
     """
     features = connection.features
     selectors = features.choices(_SELECTOR) if features.has(_SELECTOR) else ()
@@ -204,12 +204,12 @@ def set_trigger(connection: GenICamConnection, source: str | None, options: GenI
     if source != "Software":
         if features.has("TriggerActivation"):
             features.choose("TriggerActivation", options.trigger_activation)
-        _let_overlap(features, options)
+        _allow_overlap(features, options)
     features.choose("TriggerMode", "On")
 
 
-def _let_overlap(features: Features, options: GenICamCameraOptions) -> None:
-    """Let a pulse start an exposure while the frame before is read out: many cameras ignore it otherwise."""
+def _allow_overlap(features: Features, options: GenICamCameraOptions) -> None:
+    """Allow a pulse to start an exposure while the frame before is read out: many cameras ignore it otherwise."""
     if "TriggerOverlap" in options.features or not features.has("TriggerOverlap"):
         return
     offered = features.choices("TriggerOverlap")

@@ -89,22 +89,22 @@ class StartClock:
         """True if the clock was latched; it is then more reliable than the network's timing."""
         return self._latched is not None
 
-    def latch(self, looks: list[tuple[int, int, int]]) -> bool:
+    def latch(self, latches: list[tuple[int, int, int]]) -> bool:
         """Relate the clocks by latches: host time before, camera time, host time after, all ns; at least two.
 
         Return True if they agree; otherwise (a stopped clock, a stamp in other units) they are not used.
         """
         offset, at_ns = Interval(-_FOREVER_NS, _FOREVER_NS), 0
-        for before_ns, stamp_ns, after_ns in looks:
+        for before_ns, stamp_ns, after_ns in latches:
             at_ns = max(at_ns, stamp_ns)
             observed = Interval(before_ns - stamp_ns, after_ns - stamp_ns)
             offset &= Interval(observed.min_ns - self._lag_ns.max_ns, observed.max_ns - self._lag_ns.min_ns)
         # Without the lag's uncertainty: latches of a stopped clock contradict each other.
         bare = Interval(
-            max(before_ns - stamp_ns for before_ns, stamp_ns, _ in looks),
-            min(after_ns - stamp_ns for _, stamp_ns, after_ns in looks),
+            max(before_ns - stamp_ns for before_ns, stamp_ns, _ in latches),
+            min(after_ns - stamp_ns for _, stamp_ns, after_ns in latches),
         )
-        moved = len({stamp_ns for _, stamp_ns, _ in looks}) == len(looks) > 1
+        moved = len({stamp_ns for _, stamp_ns, _ in latches}) == len(latches) > 1
         if bare.is_empty or not moved:
             return False
         self._latched = self._offset = (at_ns, offset)

@@ -8,8 +8,8 @@ time stamp of the flip + one refresh (rows arrive one after the other) + the dis
 graphics driver does not count refreshes (virtual machines, some adapters on USB), only the duration of the request is
 known; the stated error is larger by half of that time and of a refresh.
 
-One program at a time has a graphics card: no desktop may run on it. The error says what to do where one does. Listing
-outputs (`slrig devices`) opens no card.
+One program at a time has a graphics card: no desktop may run on it. Where one does, the error states the remedy.
+Listing outputs (`slrig devices`) opens no card.
 
 A guard process keeps the output black between scans, after `close` and for `dark_after_s` after slrig has ended, even
 by kill -9; then the text console returns. It passes the card on to the next slrig of the same user. A service manager

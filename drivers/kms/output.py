@@ -305,7 +305,7 @@ class KmsOutput:
         monitor, edid = self._options.monitor, finding.read_edid(self._name, self._held.path)
         if monitor is not None and monitor not in (str(edid), edid and edid.name):
             message = (
-                f"output {self._name}: the rig file says that '{monitor}' is connected, found "
+                f"output {self._name}: the rig file requests the display '{monitor}', found "
                 f"'{edid or 'a display without EDID'}'; swap the cables, or correct monitor (slrig devices lists "
                 "the connected displays)"
             )

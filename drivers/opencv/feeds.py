@@ -225,7 +225,7 @@ class DeviceFeed(_CaptureFeed):
         try:
             data, grabbed = self.grab()
         except DeviceGoneError as error:
-            # OpenCV reports a camera that is silent for long as it does one that is gone or whose stream has died;
+            # OpenCV reports a camera that is silent for long as it does one that is gone or whose stream has ended;
             # but the latter at once.
             require_present(self.label, error)
             now_ns = time.monotonic_ns()
@@ -367,7 +367,7 @@ def open_capture(source: CaptureSource, parameters: Sequence[int] = ()) -> cv2.V
             message = f"no answer from {source.label}, or it sends no video; check address and network"
             raise DeviceGoneError(message)
         message = (
-            f"{source.label}: OpenCV cannot open it: it is not a camera or film, or OpenCV knows none of its formats; "
+            f"{source.label}: OpenCV cannot open it: it is not a camera or film, or OpenCV reads none of its formats; "
             "name another, or use the driver made for it"
         )
         raise DeviceError(message)

@@ -24,7 +24,7 @@ _NUMBERED = re.compile(r"%0?\d*d")
 
 
 class SourceKind(StrEnum):
-    """How the driver treats a source."""
+    """Kind of a source, which decides how the driver reads it."""
 
     DEVICE = "device"
     """A camera of the kernel, with controls: read from `arm` to `disarm`, timed by stamps, or else by arrival."""

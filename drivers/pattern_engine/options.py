@@ -44,7 +44,7 @@ class LightOptions(Strict, use_attribute_docstrings=True):
     """Largest fraction of the time with light while a sequence is played."""
 
     hold_s: Annotated[float, Field(ge=2, le=200)] = 30.0
-    """A shown pattern is held for this long, and is dark at most 2 s later, also after its host has died."""
+    """A shown pattern is held for this long, and is dark at most 2 s later, also after its host has failed."""
 
     light_margin_s: Annotated[float, Field(ge=0, le=1)] = 0.0005
     """In a played sequence, the light exceeds the exposure by this time."""

@@ -9,7 +9,7 @@ How long TI's own and other public programs for the DLPC350 wait:
                  then (DLPU018 table 2-97).
     stop         0x1A24 is read until it is 0, and the stop repeated every 100 ms, 5 to 10 times (`PatSeqCtrlStop` of
                  TI's program; `setToVideoMode` of the same file).
-    validation   first look after 110 ms, then every 10 ms (lcr4500.cpp of TI's DLP SDK, `CreateSendStartSequenceLut`).
+    validation   first read after 110 ms, then every 10 ms (lcr4500.cpp of TI's DLP SDK, `CreateSendStartSequenceLut`).
     start        10 ms after the validation (same function).
 """
 

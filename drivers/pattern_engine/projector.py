@@ -207,7 +207,7 @@ class EngineProjector(ABC, Generic[SourceT]):
         threading.Thread(target=self._hold_loop, name="light engine", daemon=True).start()
 
     def _hold_pattern(self, alone_s: float, *, again_s: float) -> None:
-        """Hold the pattern that has just begun and ends by itself after `alone_s`; then restart it every `again_s`."""
+        """Hold the pattern that has just begun and ends on its own after `alone_s`; restart it every `again_s`."""
         now_s = self._now_s()
         self._held_until_s = now_s + self._light.hold_s
         self._next_restart_s, self._restart_interval_s = now_s + alone_s / 2, again_s
@@ -222,8 +222,8 @@ class EngineProjector(ABC, Generic[SourceT]):
         return self._clock.now_ns() / 1e9
 
     def _hold_loop(self) -> None:
-        """Restart the shown pattern before the engine ends it, which proves that this program lives. End a sequence
-        that does not end by itself at `_dark_at_s`. Runs until `close`.
+        """Restart the shown pattern before the engine ends it, which proves that this program runs. End a sequence
+        that does not end on its own at `_dark_at_s`. Runs until `close`.
         """
         while True:
             self._clock.wait_until(self._clock.now_ns() + round(MAX_UNATTENDED_S * 1e9 / 20), self._state.closed)
@@ -246,7 +246,7 @@ class EngineProjector(ABC, Generic[SourceT]):
         try:
             self._engine.restart()
         except SlrigError:
-            # The next call of the user reports it; until then the engine goes dark by itself.
+            # The next call of the user reports it; until then the engine goes dark on its own.
             self._held_until_s = 0.0
 
     def _darken(self) -> list[SlrigError]:
@@ -341,6 +341,6 @@ class UsbEngineProjector(EngineProjector[EngineT], ABC):
         if self.is_polarity_unknown:
             message = (
                 "cannot play: the polarity of the LED current is unknown, and light is dim until then; "
-                "run slrig doctor, which determines it and says what to write into the rig file"
+                "run slrig doctor, which determines it and names the line for the rig file"
             )
             raise UnsupportedByDeviceError(message)

@@ -488,7 +488,7 @@ class UsbEngine(ABC):
 
     def restart(self) -> None:
         """Stop the current sequence, and start it from its beginning. It is dark meanwhile, and stays so if this fails
-        or the program dies: a stop may leave the last pattern on the mirrors.
+        or the program ends: a stop may leave the last pattern on the mirrors.
         """
         self.switch_leds(by_sequence=False)
         self.stop()

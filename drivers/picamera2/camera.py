@@ -437,7 +437,7 @@ class PiCamera:
         return fastest_us
 
     def _request(self, ahead: int) -> None:
-        """Have the next frames kept, so many of them."""
+        """Request the next frames, `ahead` of them."""
         while len(self._jobs) < ahead:
             self._jobs.append(self._camera.capture_request(wait=False))
 
@@ -502,9 +502,9 @@ class PiCamera:
         )
 
     def _exposure_by_wire_ns(self, metadata: Mapping[str, Any]) -> int:
-        """Return what the pulse is expected to last. Raises UnsupportedByDeviceError if the gain is another one."""
+        """Return the expected length of the pulse. Raises UnsupportedByDeviceError if the gain is another one."""
         if self._applied is None:
-            message = f"camera '{self._name}' exposes as its pulses last, which was not said; configure it first"
+            message = f"camera '{self._name}' exposes as long as its pulses, which were not set; configure it first"
             raise DeviceStateError(message)
         if not _is_close(metadata["AnalogueGain"], self._applied.gain):
             message = (

@@ -31,7 +31,7 @@ _LEAD_NS = 1_000_000
 
 
 class ReplayClock:
-    """The rig's clock, ns. Devices advance it to the recorded times; it never runs by itself.
+    """The rig's clock, ns. Devices advance it to the recorded times; it never runs on its own.
 
     Implements `slrig.devices.Clock`.
 
@@ -106,7 +106,7 @@ class ReplayClock:
         return True
 
     def pass_time(self, seconds: float) -> None:
-        """Let time pass, also in real time if the replay is paced."""
+        """Advance the clock, also in real time if the replay is paced."""
         passed_ns = round(seconds * 1e9 * (self._speed or 1))
         self._now_ns = self._held_ns = max(self._now_ns + passed_ns, self._held_ns)
         if self._speed:

@@ -55,7 +55,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     DeviceBusyError
         Another process shows patterns there.
     DeviceError
-        No graphical session runs, or it does not let this user in.
+        No graphical session runs, or it refuses this user.
     """
     from drivers.display.projector import DisplayProjector
     from drivers.screen.options import ScreenOptions

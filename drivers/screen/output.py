@@ -72,7 +72,7 @@ _PRESENTED_PIXMAP = 0
 _FLIP_MODES = (1, 3)
 _BLACK: Pixels = np.zeros((1, 1), np.uint8)
 _PIXEL_REMEDY = (
-    "another window lies above, or the graphics driver scales or converts: try the other backend (backend = "
+    "another window is above, or the graphics driver scales or converts: try the other backend (backend = "
     '"x11" or "sdl"), and close other programs on that output'
 )
 
@@ -89,7 +89,7 @@ class ReservedOutput:
     DeviceBusyError
         Another process shows patterns there.
     DeviceError
-        No X server runs, or it does not let this user in.
+        No X server runs, or it refuses this user.
     """
 
     def __init__(self, connection: XConnection, options: ScreenOptions) -> None:
@@ -260,7 +260,7 @@ class ReservedOutput:
                 message = (
                     f"output {self.output.name} is drawn by a compositor "
                     f"({name or 'without a name'}), which may delay, scale or tint pictures and does not exempt a "
-                    f"window that asks for it (_NET_WM_BYPASS_COMPOSITOR); {exempting(name)}; or set trust_compositor "
+                    f"window that requests it (_NET_WM_BYPASS_COMPOSITOR); {exempting(name)}; or set trust_compositor "
                     "= true if you have checked that patterns come out right"
                 )
                 raise UnsupportedByDeviceError(message)
@@ -450,7 +450,7 @@ def _open_surface(reserved: ReservedOutput, options: ScreenOptions) -> PresentSu
     if options.display not in (None, os.environ.get("DISPLAY")):
         message = (
             f"backend sdl takes its X server from the environment (DISPLAY={os.environ.get('DISPLAY')}), the rig file "
-            f'asks for {options.display}; leave display out, or take backend = "x11"'
+            f'requests {options.display}; leave display out, or take backend = "x11"'
         )
         raise UnsupportedByDeviceError(message)
     return SdlSurface(reserved)

@@ -238,7 +238,7 @@ def list_faults(output: Output, others: Sequence[Output], *, native: Size | None
     command = f"xrandr --output {output.name}"
     if monitor is not None and monitor not in (str(output.edid), output.edid and output.edid.name):
         yield (
-            f"the rig file says that '{monitor}' is connected, found '{output.edid or 'a display without EDID'}'; swap "
+            f"the rig file requests the display '{monitor}', found '{output.edid or 'a display without EDID'}'; swap "
             "the cables, or correct monitor (slrig devices lists the connected displays)"
         )
     crtc = output.crtc

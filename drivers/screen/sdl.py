@@ -40,7 +40,7 @@ _IGNORE_ERROR = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
 
 
 class SdlOutput:
-    """A full-screen window on a display that SDL knows, without an X server. Implements `PatternOutput`."""
+    """A full-screen window on a display of SDL, without an X server. Implements `PatternOutput`."""
 
     def __init__(self, canvas: Canvas, name: str, refresh_s: float) -> None:
         self._canvas = canvas
@@ -106,7 +106,7 @@ def _choose_display(found: list[tuple[str, Size, int]], options: ScreenOptions) 
 
 
 def _displays(sdl: Any) -> list[tuple[str, Size, int]]:
-    """Return name, extent and refresh rate in Hz (0: unknown) of each display that SDL knows."""
+    """Return name, extent and refresh rate in Hz (0: unknown) of each display of SDL."""
     found = []
     for index in range(sdl.SDL_GetNumVideoDisplays()):
         mode = sdl.SDL_DisplayMode()

@@ -1,4 +1,4 @@
-"""What to do where a session shows no exact pixels: which desktop runs, and how its user gets one that does."""
+"""Remedies for a session that shows no exact pixels, by the desktop that runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _X_SESSIONS = {
     "cinnamon": "log out, choose 'Cinnamon', not 'Cinnamon on Wayland', at the login screen, and log in",
     "labwc": "run sudo raspi-config, choose Advanced Options, Wayland, X11, and start the machine again",
 }
-"""How to get a session with X, by what the environment's XDG_CURRENT_DESKTOP has in it."""
+"""Steps to a session with X, by a part of the environment's XDG_CURRENT_DESKTOP."""
 
 _COMPOSITORS = {
     ("xfwm4", "xfce"): "switch compositing off: xfconf-query -c xfwm4 -p /general/use_compositing -s false",
@@ -27,7 +27,7 @@ _COMPOSITORS = {
     ("picom",): "set unredir-if-possible = true in picom.conf, or end picom",
     ("gnome", "mutter"): "no setting of GNOME changes that: log in to another desktop with X, such as Xfce",
 }
-"""How to have a window exempted, by what a compositor's name or XDG_CURRENT_DESKTOP has in it."""
+"""Steps to exempt a window, by a part of a compositor's name or XDG_CURRENT_DESKTOP."""
 
 WITHOUT_DESKTOP = (
     "or show patterns without a desktop, by the driver 'kms': end the desktop (sudo systemctl isolate "
@@ -37,7 +37,7 @@ WITHOUT_DESKTOP = (
 
 
 def session_name() -> str:
-    """The kind of a session that has no X, in words."""
+    """Describe a session that has no X."""
     if sys.platform != "linux":
         return {"win32": "Windows", "darwin": "macOS"}.get(sys.platform, sys.platform)
     desktop = os.environ.get("XDG_CURRENT_DESKTOP", "")
@@ -47,11 +47,11 @@ def session_name() -> str:
 
 
 def exact_session() -> str:
-    """What to do in place of this session, in words."""
+    """Describe the steps to a session that shows exact pixels."""
     if sys.platform != "linux":
         return "use Linux with X for the projector"
     desktop = os.environ.get("XDG_CURRENT_DESKTOP", "").lower()
-    found = next((words for name, words in _X_SESSIONS.items() if name in desktop), None)
+    found = next((steps for name, steps in _X_SESSIONS.items() if name in desktop), None)
     if found is None:
         found = "log in to a session with X (Xorg)"
         if not os.environ.get("WAYLAND_DISPLAY") and not os.environ.get("DISPLAY"):
@@ -60,9 +60,9 @@ def exact_session() -> str:
 
 
 def exempting(compositor: str) -> str:
-    """How to keep a compositor of X from drawing the patterns, in words. compositor : its name, "" if it has none."""
+    """Describe how to keep a compositor of X from drawing the patterns. compositor : its name, "" if it has none."""
     for known in (compositor.lower(), os.environ.get("XDG_CURRENT_DESKTOP", "").lower()):
-        for names, words in _COMPOSITORS.items():
+        for names, steps in _COMPOSITORS.items():
             if any(name in known for name in names):
-                return f"{words}; {WITHOUT_DESKTOP}"
+                return f"{steps}; {WITHOUT_DESKTOP}"
     return f"switch compositing off in the settings of the desktop; {WITHOUT_DESKTOP}"

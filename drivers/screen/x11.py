@@ -93,7 +93,7 @@ class XConnection:
     LibraryMissingError
         xcffib or libxcb is not installed.
     DeviceError
-        No X server runs, or it does not let this user in.
+        No X server runs, or it refuses this user.
     """
 
     def __init__(self, display: str | None = None) -> None:
@@ -178,7 +178,7 @@ class XConnection:
             self._connection.disconnect()
 
     def _receive(self) -> None:
-        """Move the events that have arrived into our queue: libxcb reads ahead, so the socket alone does not say."""
+        """Move the events that have arrived into our queue: libxcb reads ahead, so the socket alone is no proof."""
         with self._translate_errors("events"):
             while (event := self._connection.poll_for_event()) is not None:
                 self._queue.append(event)
@@ -212,14 +212,14 @@ def _import_xcffib() -> Any:
     with loading("screen", "xcffib and libxcb to speak to X", install=_INSTALL, packages="xcffib"):
         xcffib = import_module("xcffib")
         for module in ("xproto", *_EXTENSIONS.values()):
-            # Before connecting: a connection knows the events of extensions that are imported.
+            # Before connecting: a connection has the events of extensions that are imported.
             import_module(f"xcffib.{module}")
     _add_complete_notify(xcffib)
     return xcffib
 
 
 def _add_complete_notify(xcffib: Any) -> None:
-    """Make xcffib know the Present event CompleteNotify, which it lacks: it skips events with 64-bit fields."""
+    """Add the Present event CompleteNotify to xcffib, which lacks it: it skips events with 64-bit fields."""
 
     class CompleteNotifyEvent(xcffib.Event):  # type: ignore[misc]
         xge = True
@@ -262,7 +262,7 @@ def atom_name(connection: XConnection, number: int) -> str:
 def black_window(connection: XConnection, x: int, y: int, size: Size) -> int:
     """Make and map a black window at this place of the screen, above the others, without a window manager.
 
-    The pointer is invisible over it, and compositors are asked not to redirect it.
+    The pointer is invisible over it, and compositors are requested not to redirect it.
     """
     window = connection.new_id()
     connection.do(
@@ -447,7 +447,7 @@ class DisplayWakeLock:
             raise UnsupportedByDeviceError(message)
 
     def release(self) -> None:
-        """Let the displays sleep again as before."""
+        """Allow the displays to sleep again as before."""
         if self._suspends:
             self._connection.do("Suspend", False, extension=_SAVER)
         if self._saver_before is not None:

@@ -31,8 +31,8 @@ the same line again, with the same number: at most 12 times, within 2.5 s. A box
 The same number again: it repeats that answer, and does nothing else. A number up to 4999 ahead: a new command. Any
 other: ERR 3. A line lost in either direction therefore costs time, and never shows a pattern twice.
 
-Only HELLO begins a session. While it is alive (lines of its host were received within the watchdog time), every line of
-another session is answered with ERR 5, including HELLO. Without a session, all verbs except HELLO are answered with
+Only HELLO begins a session. While it is active (lines of its host were received within the watchdog time), every line
+of another session is answered with ERR 5, including HELLO. Without a session, all verbs except HELLO are answered with
 ERR 8.
 
 Verbs
@@ -89,16 +89,15 @@ States and events
     playing   a sequence of mode 0 runs          its end -> ready
     waiting   a sequence of mode 1, from its beginning to its end; lit and dark
 
-    ! FRAME index µs    a pattern of a sequence is lit since µs
-    ! DONE count        a sequence has ended, dark
-    ! FAULT code        the box switched the light off by itself, and is ready (or idle)
+    ! FRAME index µs    a pattern of a sequence is lit since µs ! DONE count        a sequence has ended, dark ! FAULT
+    code        the box switched the light off on its own, and is ready (or idle)
 
 A fault stays until a *dark* verb acknowledges it: SHOW, SEQ and TRIG are refused until then, so that a host
 cannot miss it. 1: no line of the session for watchdog_ms while lit, playing or waiting. 2: on_ms exceeded. 3: duty
 exceeded. 4: the light engine failed; a box that cannot switch its light off keeps trying.
 
 Errors: 1 invalid line (see above). 2 unknown verb. 3 not in this state, or an old number. 4 a number out of range.
-5 busy, another session is alive. 6 the light engine failed: dark, fault 4. 7 <fault> dark by an unacknowledged fault.
+5 busy, another session is active. 6 the light engine failed: dark, fault 4. 7 <fault> dark by an unacknowledged fault.
 8 no such session: send HELLO. 9 other patterns. 10 a limit: more light than duty allows.
 
 Behaviour of the host

@@ -481,7 +481,7 @@ class BoxClient:
     def _busy_message(self, by: str) -> str:
         return (
             f"the trigger box on {self._label} is in a session with another host ({by}); end that one, or wait for its "
-            "watchdog if it has died"
+            "watchdog if it has failed"
         )
 
     def _limits_message(self, refusal: BoxRefusedError) -> str:

@@ -50,7 +50,7 @@ class RefusalCode(IntEnum):
 
 
 class BoxFault(IntEnum):
-    """Reason why a box went dark by itself, the code of a FAULT event."""
+    """Reason why a box went dark on its own, the code of a FAULT event."""
 
     WATCHDOG = 1
     ON_TIME = 2

@@ -143,7 +143,7 @@ class SerialProjector:
         return (
             f"{len(sequence)} images, {DESCRIPTION} and {HEADER} are in {folder}: put the images into the light "
             f"engine's memory, in the order of their numbers, and {DESCRIPTION} onto the box (a Pico), or {HEADER} "
-            "beside its main.c (an Arduino)"
+            "next to its main.c (an Arduino)"
         )
 
     def show(self, index: int) -> DisplayedPattern:
@@ -308,7 +308,7 @@ class _RestartedError(DeviceError):
 def _fault_message(port: str, words: tuple[str, ...]) -> str:
     reasons = {str(fault.value): reason for fault, reason in _FAULTS.items()}
     reason = reasons.get(words[0] if words else "", f"unknown fault {' '.join(words)}")
-    return f"the trigger box on {port} went dark by itself: {reason}. Frames since then may be dark; scan again"
+    return f"the trigger box on {port} went dark on its own: {reason}. Frames since then may be dark; scan again"
 
 
 def export_patterns(sequence: PatternSequence, folder: Path) -> None:

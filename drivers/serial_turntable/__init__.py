@@ -2,7 +2,7 @@
 
 The protocol of lines, version 1
 --------------------------------
-ASCII, 115 200 baud unless the rig file says otherwise, lines end with a line feed; a preceding carriage return is
+ASCII, 115 200 baud unless the rig file states otherwise, lines end with a line feed; a preceding carriage return is
 ignored. Numbers are degrees with up to three decimals. The host sends one command and waits for its answer; only STOP
 may be sent while the board turns.
 

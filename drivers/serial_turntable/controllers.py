@@ -110,7 +110,7 @@ class LineController:
                 return int(found[2])
         answer = "got no answer" if received is None else f"found {received!r}"
         message = (
-            f"asked {self._lines.label} for its identity (ID?), expected 'slrig-turntable 1 STEPS', {answer}; check "
+            f"requested the identity of {self._lines.label} (ID?), expected 'slrig-turntable 1 STEPS', {answer}; check "
             "its baud rate, its power and its firmware"
         )
         raise DeviceError(message)
@@ -202,7 +202,7 @@ class GrblController:
                 self.halt()
                 message = (
                     f"{self._lines.label} did not reach {position:.3f} {self._axis} within turn_s; it was at "
-                    f"{found.position:.3f}, in state {found.state}, and was stopped; let it turn faster or raise turn_s"
+                    f"{found.position:.3f}, in state {found.state}, and was stopped; turn it faster or raise turn_s"
                 )
                 raise DeviceError(message)
             self._lines.wait(_POLL_S)
@@ -290,7 +290,7 @@ class GrblController:
         """Raise DeviceError if a line reports an error."""
         if _BANNER.match(line):
             message = (
-                f"{self._lines.label} restarted by itself ({line!r}) and lost its position; check its power and its "
+                f"{self._lines.label} restarted on its own ({line!r}) and lost its position; check its power and its "
                 "emergency stop"
             )
             raise DeviceError(message)

@@ -334,7 +334,7 @@ class V4L2Camera:
             raise UnsupportedByDeviceError(message)
 
     def _set_controls(self) -> list[str]:
-        """Set every control; return notes on those that the device refuses and that nobody needs."""
+        """Set every control; return notes on optional ones that the device refuses."""
         exposure, gain = self._units
         notes = []
         for step in ordered_settings(
@@ -379,7 +379,7 @@ class V4L2Camera:
         period_s = self._format.period_ns / 1e9
         exposures = (period_s, period_s)
         if self._exposure is not None:
-            # Longer ones do not fit into a frame, whatever the control accepts.
+            # Longer ones do not fit into a frame, even if the control accepts them.
             shortest_s, longest_s = self._exposure.range_s
             exposures = (
                 shortest_s,

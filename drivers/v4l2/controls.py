@@ -1,8 +1,8 @@
 """Controls of a device: setting and reading back, image processing to switch off, and units of exposure and gain.
 
 What a device declares is a bound: some take only certain exposures between the ends of their range (see
-`set_exposure`), and refuse controls that they list. Only exposure and gain are worth an error; what else cannot be set,
-and was not named by the user, is noted.
+`set_exposure`), and refuse controls that they list. Only exposure and gain are worth an error; other controls that
+cannot be set, and that the user does not name, are noted.
 
 Order matters: a device refuses or forgets an exposure while automatic exposure is on.
 
@@ -318,18 +318,18 @@ def ordered_settings(
 
 
 def require_focus(handle: int, node: Path, controls: Controls, named: Collection[str]) -> None:
-    """Raise UnsupportedByDeviceError where the lens can be moved, and the user does not say where it is to stand.
+    """Raise UnsupportedByDeviceError where the lens can be moved, and the user does not set its position.
 
-    Another program, a new plug or the camera itself moves it, and a calibration holds for one place. named : controls
-    that the user sets.
+    Another program, a new plug or the camera itself moves it, and a calibration holds for one position. named :
+    controls that the user sets.
     """
     lens = controls.get(FOCUS_ABSOLUTE)
     if lens is None or lens.name in named:
         return
     message = (
-        f"{node}: a motor moves its lens, and a calibration holds for one place of it. Make the picture sharp, and "
-        f"write where the lens stands then into the camera's table: focus = {get_control(handle, node, lens)} is where "
-        f'it stands now. Where no motor moves it: skip_controls = ["{lens.name}"]'
+        f"{node}: a motor moves its lens, and a calibration holds for one position of it. Make the picture sharp, and "
+        f"write the lens's position into the camera's table: focus = {get_control(handle, node, lens)} is the present "
+        f'one. Where no motor moves it: skip_controls = ["{lens.name}"]'
     )
     raise UnsupportedByDeviceError(message)
 

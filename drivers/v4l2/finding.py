@@ -27,7 +27,7 @@ DEV = Path("/dev")
 @dataclass(frozen=True, slots=True)
 class NodeIdentity:
     """Identity of a node. captures : it streams frames in one plane. is_uvc : it uses the kernel's driver for USB Video
-    Class cameras. focus : where its lens stands; None without a motor.
+    Class cameras. focus : position of its lens; None without a motor.
     """
 
     card: str

@@ -267,7 +267,7 @@ def _samples(data: Bytes, layout: PixelLayout, size: Size, stride_bytes: int) ->
         message = (
             f"a sample of {largest} came, and {layout.bit_depth} bits hold {2**layout.bit_depth - 1} at most: this "
             f"receiver stores samples shifted up, as those of Jetson do; write sample_shift = {16 - layout.bit_depth}, "
-            "or what its documents say"
+            "or the shift in its documents"
         )
         raise CorruptFrameError(message)
     return image

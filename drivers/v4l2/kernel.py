@@ -329,8 +329,8 @@ def device_error(node: Path, action: str, error: OSError) -> DeviceError:
     if number == errno.ENOSPC:
         return UnsupportedByDeviceError(
             f"{cause}; the USB bus has not enough bandwidth left for this stream: plug the cameras into different USB "
-            "controllers (lsusb -t). Many webcams ask for the whole bus whatever they send: for a raw format, sudo "
-            "modprobe -r uvcvideo and sudo modprobe uvcvideo quirks=0x80 has the kernel reckon what it takes. Or "
+            "controllers (lsusb -t). Many webcams request the whole bus for any format: for a raw one, sudo "
+            "modprobe -r uvcvideo and sudo modprobe uvcvideo quirks=0x80 makes the kernel compute its need. Or "
             'request a smaller size_px, a lower frame_rate_hz, or pixel_format = "MJPG"'
         )
     if number in REFUSED:
@@ -339,10 +339,10 @@ def device_error(node: Path, action: str, error: OSError) -> DeviceError:
 
 
 def stream_error(node: Path, action: str, error: OSError) -> DeviceError:
-    """As `device_error` for a request about frames, where EIO means that the stream has died."""
+    """As `device_error` for a request about frames, where EIO means that the stream has failed."""
     if error.errno == errno.EIO:
         return DeviceGoneError(
-            f"{node}: {action}: {os.strerror(errno.EIO)}; its stream has died: plug it in again, and reopen it"
+            f"{node}: {action}: {os.strerror(errno.EIO)}; its stream has failed: plug it in again, and reopen it"
         )
     return device_error(node, action, error)
 

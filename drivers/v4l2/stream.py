@@ -450,7 +450,7 @@ class V4L2Stream:
         Raises
         ------
         DeviceGoneError
-            The device was unplugged, or its stream has died.
+            The device was unplugged, or its stream has failed.
         DeviceStateError
             The waker has been used.
         """
@@ -469,7 +469,7 @@ class V4L2Stream:
                     return filled
                 if events[self._handle] & _BROKEN:
                     message = (
-                        f"{self._node}: the stream has died; the camera is gone or has failed: plug it in again, and "
+                        f"{self._node}: the stream has ended; the camera is gone or has failed: plug it in again, and "
                         "reopen it"
                     )
                     raise DeviceGoneError(message)
@@ -554,7 +554,7 @@ class FrameCounter:
     _intervals_ns: list[float] = field(default_factory=list)
 
     def begin(self) -> None:
-        """Start a new stream, whose sequence numbers start again."""
+        """Start a new stream, with sequence numbers from its start."""
         self._last = None
         self.ahead_ns = 0
         self._intervals_ns.clear()

@@ -209,7 +209,7 @@ class CameraState:
         ):
             if not low * (1 - within) <= requested <= high * (1 + within):
                 range_text = f"{low:.6g} to {high:.6g}" if low < high else f"{low:.6g} only"
-                message = f"camera '{self.name}': asked for {name} {requested:.6g}, it takes {range_text}; {hint}"
+                message = f"camera '{self.name}': requested {name} {requested:.6g}, it takes {range_text}; {hint}"
                 raise UnsupportedByDeviceError(message)
 
     def check_arming(self, count: int, trigger: Trigger, info: CameraInfo, *, hint: str = "") -> None:
@@ -223,7 +223,7 @@ class CameraState:
             raise DeviceStateError(f"camera '{self.name}' is armed already; disarm it first")
         if count < 1 or trigger not in info.triggers:
             raise UnsupportedByDeviceError(
-                f"camera '{self.name}': asked for {count} frames by {trigger} trigger, it gives 1 or more by: "
+                f"camera '{self.name}': requested {count} frames by {trigger} trigger, it gives 1 or more by: "
                 f"{', '.join(sorted(info.triggers))}{hint}"
             )
 

@@ -112,7 +112,7 @@ def test_the_longest_table_takes_several_reports(bench: Bench) -> None:
 def test_a_flash_of_another_name_or_with_too_few_pictures_is_refused(tmp_path: Path) -> None:
     flash = flash_350()
     bench = Bench(tag="factory")
-    with pytest.raises(UnsupportedByDeviceError, match=f'tagged "{flash.tag}", the engine says "factory"'):
+    with pytest.raises(UnsupportedByDeviceError, match=f'tagged "{flash.tag}", the engine has "factory"'):
         bench.open()
     assert bench.engine.lit is None
     bench.flash = FlashContents(flash.folder, None, flash.pictures)

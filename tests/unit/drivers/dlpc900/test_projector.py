@@ -72,7 +72,10 @@ def test_each_entry_of_a_played_sequence_has_its_light_and_the_dark_after_it(ben
 
 @pytest.mark.parametrize(
     ("version", "mirrors", "told"),
-    [((5, 9), 1, "firmware 5.9, this driver needs 6.0"), ((6, 0), 9, "mirrors of type 9, this driver knows DLP6500")],
+    [
+        ((5, 9), 1, "firmware 5.9, this driver needs 6.0"),
+        ((6, 0), 9, "mirrors of type 9, this driver supports DLP6500"),
+    ],
 )
 def test_what_is_not_known_is_refused_and_left_dark(version: tuple[int, int], mirrors: int, told: str) -> None:
     bench = Bench(version=version)

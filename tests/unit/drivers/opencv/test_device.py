@@ -210,7 +210,7 @@ def test_image_processing_is_off_and_a_control_that_fails_is_noted(plugged: Plug
 
 def test_a_lens_with_a_motor_needs_its_place(plugged: Plug) -> None:
     plugged()
-    with pytest.raises(UnsupportedByDeviceError, match=r"a motor moves its lens.*focus = 0 is where it stands now"):
+    with pytest.raises(UnsupportedByDeviceError, match=r"a motor moves its lens.*focus = 0 is the present one"):
         opened(focus=None)
     opened(focus=None, skip_controls=["focus_absolute"]).close()
 

@@ -56,7 +56,7 @@ def test_a_source_declares_what_its_table_says() -> None:
         assert camera.configure(CameraSettings(0.01005)) == AppliedSettings(0.01, 1.0, min_period_s=0.02)
         with pytest.raises(UnsupportedByDeviceError, match=r"exposure_s 0.02, it takes 0.01 only"):
             camera.configure(CameraSettings(0.02))
-        with pytest.raises(UnsupportedByDeviceError, match="asked for gain 2, it takes 1 only; OpenCV has no control"):
+        with pytest.raises(UnsupportedByDeviceError, match="requested gain 2, it takes 1 only; OpenCV has no control"):
             camera.configure(CameraSettings(0.01, 2.0))
 
 

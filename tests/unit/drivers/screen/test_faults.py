@@ -94,7 +94,7 @@ SHARED = "eDP-1 shows the same part of the screen; xrandr --output HDMI-1 --righ
         (shown(outputs=("HDMI-1", "eDP-1")), {}, ("eDP-1 shows the same",)),
         (OFF, {}, ("it is switched off; xrandr --output HDMI-1 --preferred --right-of eDP-1",)),
         (OFF, {"native": Size(854, 480)}, ("--mode 854x480 --right-of eDP-1",)),
-        (OUTPUT, {"monitor": "BNQ TH585"}, ("'BNQ TH585' is connected, found 'EPS PJ 720'",)),
+        (OUTPUT, {"monitor": "BNQ TH585"}, ("the display 'BNQ TH585', found 'EPS PJ 720'",)),
         # All faults come together.
         (shown(mode=DESK, size=DESK.size, rotation=2, gamma=RAMP // 2), {}, ("raster", "turned left", "gamma")),
     ],

@@ -86,7 +86,7 @@ def test_settings_that_keep_a_table_from_turning_are_refused(
         (b"error:22\r\n", "error:22 to 'G21 G90 G53 G0 X90.0000': it has no feed rate"),
         (b"error:99\r\n", "error:99.*documentation of its numbers"),
         (b"ALARM:1\r\n", "ALARM:1.*limit switch"),
-        (BOOT, "restarted by itself.*lost its position"),
+        (BOOT, "restarted on its own.*lost its position"),
     ],
 )
 def test_what_the_controller_refuses_is_reported_in_words_and_ends_all_turning(answer: bytes, words: str) -> None:
@@ -106,7 +106,7 @@ def test_what_the_controller_refuses_is_reported_in_words_and_ends_all_turning(a
     [
         (b"ALARM:2\r\n", "ALARM:2.*soft limits"),
         (b"<Alarm|MPos:1.000,0.000,0.000|FS:0,0>\r\n", "state Alarm"),
-        (BOOT, "restarted by itself"),
+        (BOOT, "restarted on its own"),
         (b"<Idle|MPos:1.000,oops|FS:0,0>\r\n", "is at 1.000°.*tolerance_deg = 0.1"),
         (b"<Idle|MPos:x,0.000,0.000>\r\n", "has no position"),
     ],

@@ -240,7 +240,7 @@ def test_an_automatic_that_is_refused_and_harmless_is_noted(plugged: Plug, name:
 
 def test_a_lens_with_a_motor_needs_its_place(plugged: Plug) -> None:
     device = plugged(Faked(controls=changed("Focus, Absolute", default=37)))
-    with pytest.raises(UnsupportedByDeviceError, match=r"a motor moves its lens.*focus = 37 is where it stands now"):
+    with pytest.raises(UnsupportedByDeviceError, match=r"a motor moves its lens.*focus = 37 is the present one"):
         device.open_camera(**FAST, focus=None)
     for options in ({"focus": 40}, {"focus": None, "controls": {"focus_absolute": 40}}):
         device.open_camera(**FAST, **options).close()
