@@ -564,7 +564,7 @@ AnyObject = Annotated[
 class Scene(Strict):
     """Scene file: a name and one or more objects.
 
-    interreflection : diffuse light goes on from each surface to the others, once. Mirrors (`Mirror`) work without it.
+    interreflection : diffuse light passes from each surface to the others, once. Mirrors (`Mirror`) work without it.
     """
 
     name: str = ""

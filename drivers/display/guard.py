@@ -59,7 +59,7 @@ class GuardProcess:
         return self._request(b"step back\n")
 
     def release(self) -> None:
-        """End it: what is under the black is visible again. Idempotent."""
+        """End it: the content below the black is visible again. Idempotent."""
         with self._lock:
             with suppress(OSError, ValueError):
                 self._send(b"release\n")

@@ -240,7 +240,7 @@ class WorkerThread:
         self._thread.start()
 
     def run(self, job: Callable[[], Result], *, timeout_s: float) -> Result:
-        """Run a job on the thread; return or raise what it does.
+        """Run a job on the thread; return its result or raise its exception.
 
         Raises
         ------

@@ -33,7 +33,7 @@ def link_notes(connection: GenICamConnection) -> list[str]:
             notes.append(
                 f"all USB cameras together have {memory_mb} MB of the system (usbfs_memory_mb), {_FRAMES} of its frames"
                 f" need {needed_mb} MB: frames may be lost without an error; run: sudo sh -c 'echo {better_mb} > "
-                f"{USBFS}', and for good add usbcore.usbfs_memory_mb={better_mb} to the kernel's command line"
+                f"{USBFS}', and to keep it add usbcore.usbfs_memory_mb={better_mb} to the kernel's command line"
             )
     elif features.has("GevSCPSPacketSize"):
         packet_bytes, kept_bytes = int(features.value("GevSCPSPacketSize")), _number(RECEIVE)

@@ -174,7 +174,7 @@ class UsbLink:
             if report[0] & FAILED:
                 message = (
                     f"{self.name} refused the command {command:#06x}; switch it off and on, and update its firmware "
-                    f"to {self.kind.firmware} or later if it goes on"
+                    f"to {self.kind.firmware} or later if it continues"
                 )
                 raise CommandRefusedError(message)
             return data[:length]

@@ -113,7 +113,7 @@ TRIGGER_MODE = Path("/sys/module/imx296/parameters/trigger_mode")
 _TRIGGERED_SENSOR = "imx296"
 _WIRED_BUFFERS = 12
 _WIRED_AHEAD = 10
-"""Frames that may wait for `read` while pulses go on."""
+"""Frames that may wait for `read` while pulses continue."""
 _SHORTEST_PULSE_S = 50e-6
 _SUSPENDED_NS = 1_000_000
 
@@ -191,7 +191,7 @@ class PiStream:
 
 
 def require_trigger_mode(name: str, model: str, *, external: bool) -> None:
-    """Raise UnsupportedByDeviceError unless the sensor is switched to what is requested: pulses on XTR, or none."""
+    """Raise UnsupportedByDeviceError unless the sensor is in the requested mode: pulses on XTR, or none."""
     if model != _TRIGGERED_SENSOR:
         if external:
             message = (

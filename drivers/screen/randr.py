@@ -234,7 +234,7 @@ def require_exact(output: Output, others: Sequence[Output], *, native: Size | No
 
 
 def list_faults(output: Output, others: Sequence[Output], *, native: Size | None, monitor: str | None) -> Iterator[str]:
-    """Yield every fault of an output: what was found, and the command that corrects it."""
+    """Yield every fault of an output, with the command that corrects it."""
     command = f"xrandr --output {output.name}"
     if monitor is not None and monitor not in (str(output.edid), output.edid and output.edid.name):
         yield (

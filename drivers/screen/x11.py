@@ -178,7 +178,7 @@ class XConnection:
             self._connection.disconnect()
 
     def _receive(self) -> None:
-        """Move the events that have arrived into our queue: libxcb reads ahead, so the socket alone is no proof."""
+        """Move the events that have arrived into our queue: libxcb reads ahead, so the socket alone proves nothing."""
         with self._translate_errors("events"):
             while (event := self._connection.poll_for_event()) is not None:
                 self._queue.append(event)
@@ -425,7 +425,7 @@ class DisplayWakeLock:
             self._power_before = connection.has(_DPMS) and bool(connection.ask("Info", extension=_DPMS).state)
             if self._power_before:
                 connection.do("Disable", extension=_DPMS)
-        # Wake a display that is asleep: what is on it is black.
+        # Wake a display that is asleep: its picture is black.
         connection.do("ForceScreenSaver", 0)
         if self.power_level() != _POWER_ON:
             connection.do("ForceLevel", _POWER_ON, extension=_DPMS)

@@ -321,7 +321,7 @@ def device_error(node: Path, action: str, error: OSError) -> DeviceError:
     if number == errno.EBUSY:
         holders = list_holders(node)
         by = f" by {', '.join(holders)}" if holders else ""
-        return DeviceBusyError(f"{cause}; it is held{by}: close that program (fuser -v {node} lists who has it open)")
+        return DeviceBusyError(f"{cause}; it is held{by}: close that program (fuser -v {node} lists its users)")
     if number in (errno.EACCES, errno.EPERM):
         return DeviceError(
             f"{cause}; you may not open it: add yourself to its group (sudo usermod -aG video $USER), and log in again"

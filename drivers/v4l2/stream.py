@@ -173,7 +173,7 @@ def negotiate_format(handle: int, node: Path, options: V4L2Options) -> Negotiate
     if options.frame_rate_hz is None and not _reaches(1e9 / period_ns, MIN_RATE_HZ):
         notes = (
             f"gives {1e9 / period_ns:.3g} frames per second in {code.strip()} {size}, which makes scans slow: choose a "
-            f"smaller size_px or another pixel_format (v4l2-ctl -d {node} --list-formats-ext lists what is faster)",
+            f"smaller size_px or another pixel_format (v4l2-ctl -d {node} --list-formats-ext lists faster ones)",
         )
     slower = tuple(slower_ns) if options.frame_rate_hz is None else ()
     return NegotiatedFormat(layout, size, int(pix.bytesperline), period_ns, slower, notes)

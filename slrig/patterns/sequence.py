@@ -63,7 +63,7 @@ SEQUENCES: Mapping[SequenceName, SequenceOptions] = {
         period_px=8, steps=4, line_width_px=None, inverses=False, closing=0, sines=True
     ),
 }
-"""`slrig/scan/README.md` lists what they were chosen by, with costs and results."""
+"""`slrig/scan/README.md` lists the reasons for them, with costs and results."""
 
 
 def scan_patterns(

@@ -716,7 +716,7 @@ def _other_images(pixels: FloatArray, size: Size) -> Iterator[tuple[str, FloatAr
     yield "mirrored left to right", np.column_stack([right - x, y])
     yield "mirrored top to bottom", np.column_stack([x, bottom - y])
     yield "turned by 180°", np.column_stack([right - x, bottom - y])
-    # A picture turned by 90° has its extents exchanged; what was stored is of the stated size.
+    # A picture turned by 90° has its extents exchanged; the stored one has the stated size.
     yield "turned by 90°", np.column_stack([y, bottom - x])
     yield "turned by 270°", np.column_stack([right - y, x])
     yield "mirrored and turned by 90°", np.column_stack([y, x])

@@ -52,7 +52,7 @@ _MIN_VALUES = 100  # different ones, of which some are then neighbours
 _MIN_PILE = 4  # times the samples of the next value: noise has fewer at its end
 _MAX_COUNTED = 200_000  # samples of an image
 _BAND_BYTES = 2**22
-"""Size of what is computed from images at a time: it fits the cache of a core."""
+"""Size of the part of images that is computed at a time: it fits the cache of a core."""
 
 
 def stack_rows(images: Images, rows: slice = slice(None)) -> NDArray[np.float32]:

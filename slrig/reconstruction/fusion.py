@@ -186,7 +186,7 @@ def _measure_light(exposures: Sequence[_ExposureImages], exposures_s: FloatArray
     """(k,) float64: light of the projector in each exposure, as a share of the longest's.
 
     Sensors and shutters are not exact, and short exposures of a projector that refreshes get light by chance. It is
-    measured where two consecutive exposures are clear of noise, and taken from the exposure times if they nowhere are.
+    measured where two consecutive exposures are clear of noise, and taken from the exposure times otherwise.
     """
     light = [1.0]
     for (long, short), (long_s, short_s) in zip(pairwise(exposures), pairwise(exposures_s), strict=True):

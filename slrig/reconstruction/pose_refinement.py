@@ -27,7 +27,7 @@ from slrig.reconstruction.redundancy import (
 from slrig.reconstruction.triangulation import triangulate_camera_projector
 
 MAX_TURN_DEG = 3.0
-"""Of a device that was bumped; what moved more has to be calibrated again."""
+"""Of a device that was bumped; one that moved more has to be calibrated again."""
 
 MAX_SHIFT = 0.05
 """Of a device that was bumped, as a part of its baseline."""
@@ -37,7 +37,7 @@ _SHIFT = 0.01  # the same for its shift, as a part of the baseline
 _POINTS = 15_000  # of each camera, on whole curves
 _EQUATIONS = 5000  # of a pair: neighbours along a stripe share most of their light, and add little
 _ROUNDS = 30
-_MOST_STEP = 0.5  # of each parameter in one round: farther, wrong neighbours lead the search astray
+_MOST_STEP = 0.5  # of each parameter in one round: farther, wrong neighbours mislead the search
 _STEP = 1e-3  # of the parameters, for derivatives: a hundredth of a pixel
 _LEAST_GAIN = 0.99  # of the scatter in one round: what still changes then moves along the stripes
 

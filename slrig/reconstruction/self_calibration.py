@@ -6,7 +6,7 @@ pose except for the length of the baseline, and, with prior knowledge of focal l
 (Hartley and Zisserman, Multiple View Geometry, 2004, chapters 9 and 19).
 
 `self_calibrate` minimises Σ ρ((r / σ)²) / e + zᵀ z: r the distance from the epipolar line, projector pixels; ρ(x) =
-2 √(1 + x) − 2; z the change of all parameters in standard deviations of what was known before (a prior of mean 0 and
+2 √(1 + x) − 2; z the change of all parameters in standard deviations of the prior knowledge (a prior of mean 0 and
 covariance L Lᵀ, change = L z). Parameters without prior variance stay. The same function therefore starts from rough
 guesses of a new rig, and improves a calibration that a board gave.
 
@@ -157,7 +157,7 @@ def self_calibrate(
     if baseline_mm is not None:
         problem, start = _from_nothing(problem, baseline_mm)
     solved = problem.solve(_POINTS, start, _USUAL_EFFECT)
-    # Once: a large effect lets the prior draw the solution off, and what that leaves would make it larger still.
+    # Once: a large effect moves the solution towards the prior, and larger residuals would increase it further.
     effect, contradiction, start = problem.design_effect(solved), problem.contradiction(solved), solved.z
     if baseline_mm is not None:
         # About the poses that were found, the baseline has the given length.
@@ -217,7 +217,7 @@ class _Problem:
             most = max([len(pairs) for index, pairs in blocks if index not in usable], default=0)
             message = (
                 f"camera {', '.join(map(repr, missing))}: expected at least {_MIN_PAIRS} pixels at which columns and "
-                f"rows were decoded, found {most}; play both axes, and light more of what the camera sees"
+                f"rows were decoded, found {most}; play both axes, and light more of the camera's view"
             )
             raise SolveRefusedError(message)
         return cls((*prior.cameras.values(), prior.projector), _root(covariance), blocks)

@@ -120,7 +120,7 @@ def explain_missing_board(grey: GreyImage, board: Board) -> str:
 def explain_partial_board(part: str, clipped_sides: list[str], *, is_dark: bool = False) -> str:
     """Describe that only a part of the board is found, and what to do.
 
-    clipped_sides : sides of the image beyond which the board goes on; is_dark : it is dark beyond the part.
+    clipped_sides : sides of the image beyond which the board continues; is_dark : it is dark beyond the part.
     """
     if is_dark:
         return (

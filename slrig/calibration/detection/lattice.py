@@ -120,7 +120,7 @@ class Lattice:
         return [(sample_nearest(level, board_map(line)) - low) / max(high - low, 1e-9) for line in lines]
 
     def clipped_sides(self, shape: tuple[int, ...]) -> list[str]:
-        """Sides of an image of this shape (H, W) beyond which the grid would go on: left, right, upper, lower."""
+        """Sides of an image of this shape (H, W) beyond which the grid would continue: left, right, upper, lower."""
         board_map = self.board_map()
         if board_map is None:
             return []

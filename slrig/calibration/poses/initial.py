@@ -1,6 +1,6 @@
 """Initial estimate of devices and poses while poses still arrive, from board corners and projected light.
 
-Each device is fitted separately. A prior on its lens determines what the poses do not yet: one pose suffices for an
+Each device is fitted separately. A prior on its lens replaces missing poses: one pose suffices for an
 estimate, and parallel poses do no harm. A solve is better and takes longer.
 """
 
