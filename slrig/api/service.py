@@ -246,7 +246,7 @@ class Service:
         self.schedules = ScheduleStore(database, notice=partial(tell_run, outbox))
         scans = ScanTask(manager, self._usual_scan, self._require_healthy)
         self.tasks = Tasks(
-            manager, self.calibrations, self.acceptance, scans, tidy=partial(self.retention.look, "calibration")
+            manager, self.calibrations, self.acceptance, scans, tidy=partial(self.retention.check, "calibration")
         )
         # The folder's lock keeps every other process out.
         self.scheduler = Scheduler(self.schedules, self.tasks, alone=True)
@@ -291,7 +291,7 @@ class Service:
         """Measure a job that is over, make room, and go on with the model that a scan is a view of."""
         if record.kind is JobKind.SCAN:
             self.shooting.view_ended(record)
-        self.retention.look(record.kind)
+        self.retention.check(record.kind)
         try:
             if record.kind is JobKind.VERIFICATION or record.kind in RIG_JOBS:
                 self.store.prune(record.kind, _MOST_ON_RECORD)

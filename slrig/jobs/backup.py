@@ -1,4 +1,4 @@
-"""A backup of a data folder, made while a service may be using it, and its way back into a data folder.
+"""Backup of a data folder, also while a service uses it, and restore.
 
 TO/backup.json   what was copied and what was left out: `Manifest`; written last
 TO/data/         the files, as they lie in the data folder
@@ -32,7 +32,7 @@ from slrig.jobs.records import JobKind, JobState, utc_now
 MANIFEST, DATA = "backup.json", "data"
 
 OF_ONE_RUN = frozenset({"lock", "holder", "service.json", "cache", "keys.lock", "first-key"})
-"""What only the process that holds a data folder, or only this machine, can use; and a key that nobody took yet."""
+"""Files that only the process that holds a data folder, or only this machine, can use; and the unread first key."""
 
 _CHUNK_BYTES = 2**20
 _MOST_TRIES = 5
@@ -40,7 +40,7 @@ _MOST_TRIES = 5
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """What a backup holds. files, folders : by their paths in the data folder, with slashes.
+    """Contents of a backup. files, folders : by their paths in the data folder, with slashes.
 
     left_out : what was in the data folder as the backup began and is not in it, each with the reason. scans : how many
     scans have files in it.
@@ -56,7 +56,7 @@ class Manifest:
 
     @property
     def size_bytes(self) -> int:
-        """Of all its files."""
+        """Total size of its files."""
         return sum(entry.size_bytes for entry in self.files.values())
 
 
@@ -71,14 +71,12 @@ def back_up(root: Path, to: Path, *, previous: Path | None = None) -> Manifest:
     Raises
     ------
     StorageError
-        `root` is no data folder, `to` exists, `previous` is no backup, or the disk refused.
+        `root` is not a data folder, `to` exists, `previous` is not a backup, or the disk refused.
     """
     root, to = root.resolve(), to.resolve()
     with _refusals(root):
         if not (root / DATABASE).is_file():
-            message = (
-                f"{root} holds no {DATABASE}: it is no data folder of slrig. Name the one that slrig serve was given."
-            )
+            message = f"{root} holds no {DATABASE}: it is not a data folder of slrig. Name the folder of slrig serve."
             raise StorageError(message)
         if to.is_relative_to(root) or to.exists():
             why = "exists already" if to.exists() else "lies in the data folder itself"
@@ -139,12 +137,12 @@ def restore(backup: Path, root: Path) -> Manifest:
 
 
 def read_manifest(backup: Path) -> Manifest:
-    """What a backup says of itself. Raises StorageError, where it is none, too."""
+    """The manifest of a backup. Raises StorageError, also where the folder is not a backup."""
     path = backup / MANIFEST
     try:
         manifest = _manifest_adapter.validate_json(path.read_bytes())
     except (OSError, ValidationError) as error:
-        message = f"{path} cannot be read: {backup} is no whole backup. Name a folder that slrig backup made."
+        message = f"{path} cannot be read: {backup} is not a complete backup. Name a folder that slrig backup made."
         raise StorageError(message) from error
     for name in (*manifest.files, *manifest.folders):
         parts = PurePosixPath(name).parts
@@ -162,7 +160,7 @@ class _Earlier:
     files: Mapping[str, FileEntry]
 
     def linked(self, source: Path, name: str, to: Path) -> FileEntry | None:
-        """Have `to` be a link to the same file there, if it has the size and time of `source`; None if not."""
+        """Link `to` to the same file there, if that has the size and time of `source`; None if not."""
         entry, kept = self.files.get(name), self.data / name
         if entry is None or not kept.is_file():
             return None
@@ -193,7 +191,7 @@ class _BackupCopy:
         self._earlier = earlier
 
     def everything(self, scans: Mapping[str, JobState]) -> None:
-        """Copy the data folder, but for its records. Of scans, only those that had ended."""
+        """Copy the data folder except its records. Of scans, only those that had ended."""
         self._contents("", leave=OF_ONE_RUN | {SCANS})
         self._make(SCANS)
         for scan, state in scans.items():
@@ -298,7 +296,7 @@ def _unfollowed(path: str, flags: int) -> int:
 
 
 def _created(path: Path) -> BinaryIO:
-    """A new file that nobody else may read."""
+    """A new file that only its owner may read."""
     return open(path, "xb", opener=lambda name, flags: os.open(name, flags, 0o600))
 
 
@@ -311,11 +309,11 @@ def _copy_records(source: Path, to: Path) -> dict[str, JobState]:
         closing(sqlite3.connect(f"{source.as_uri()}?mode=ro", uri=True, timeout=PATIENCE_S)) as records,
         closing(sqlite3.connect(to)) as copy,
     ):
-        # In one step: with a write-ahead log it holds up no writer, and steps would begin anew with every change.
+        # In one step: with a write-ahead log it blocks no writer, and steps would start over with every change.
         records.execute("BEGIN")
         records.execute("SELECT count(*) FROM sqlite_schema").fetchone()
         records.backup(copy)
-        # What waited would begin by itself on the rig of whoever restores this. As under way, it is settled as cut off.
+        # A waiting job would start by itself on the rig after a restore. Marked as running, it ends as interrupted.
         copy.execute("UPDATE job SET state = ? WHERE state = ?", (JobState.CAPTURING, JobState.QUEUED))
         copy.commit()
         rows = copy.execute("SELECT id, state FROM job WHERE kind = ? ORDER BY number", (JobKind.SCAN,))
@@ -344,7 +342,7 @@ def _records_errors(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _new_folder(to: Path) -> Iterator[Path]:
-    """A hidden folder beside `to` that takes its place, durable, when the block ends well, and is removed if not."""
+    """A hidden folder next to `to` that replaces it, durably, when the block succeeds, and is removed if not."""
     staged = staging_name(to)
     staged.mkdir(mode=0o700)
     try:

@@ -1,21 +1,21 @@
-"""The data folder: where scans and calibrations lie, how scans get there in one rename, and who may use it.
+"""The data folder: its layout, how scans get there in one rename, and who may use it.
 
-DATA/lock            locked by the one process that owns the folder, as long as it lives; empty
-DATA/holder          that process's id, and that of the last one where none lives
+DATA/lock            locked by the one process that owns the folder, as long as it runs; empty
+DATA/holder          that process's id, and that of the last one where none runs
 DATA/slrig.sqlite    the records
 DATA/scans/ID/       a finished scan: bundle/, mesh.ply, report.json ..., and files.json with the digests of all;
                      label.json where it was renamed
 DATA/calibrations/   calibrations and their sessions: see `slrig.calibrate.store`
 DATA/acceptance/     acceptance tests: see `slrig.accept.store`
 DATA/models/         models of several scans: see `slrig.model_jobs.job`
-DATA/hand_eye/       where the rig is on a robot: see `slrig.calibrate.hand_eye`
-DATA/presets/NAME.json  presets that were put: see `slrig.scan.plan`
-DATA/webhook.json    the webhook that was set by request: see `slrig.schedule.notices`
+DATA/hand_eye/       position of the rig on a robot: see `slrig.calibrate.hand_eye`
+DATA/presets/NAME.json  stored presets: see `slrig.scan.plan`
+DATA/webhook.json    the webhook set by a request: see `slrig.schedule.notices`
 DATA/clock.json      the time that ages are reckoned by: see `slrig.jobs.retention`
-DATA/doctor.json     what `slrig doctor` found last, and conform.json: see `slrig.doctor.job`
+DATA/doctor.json     latest findings of `slrig doctor`, and conform.json: see `slrig.doctor.job`
 DATA/.incoming/ID/   a scan, a pose, a solve or a model being made; swept at the next start
-DATA/.orphans/ID/    files found at start that no record knows, a damaged database; kept: they may be somebody's work
-DATA/.trash/         what the limits of the settings removed, for a day: see `slrig.jobs.retention`
+DATA/.orphans/ID/    files found at start that no record knows, a damaged database; kept: they may be of value
+DATA/.trash/         files removed by the limits of the settings, for a day: see `slrig.jobs.retention`
 DATA/cache/          compiled kernels, where the package's own folder cannot be written
 """
 
@@ -71,7 +71,7 @@ def write_entries(folder: Path) -> None:
     """Write `FILES`: the digests of all files of a folder. Raises StorageError."""
     found = {}
     for path in sorted(folder.rglob("*")):
-        # A label may change: it is no part of what was committed.
+        # A label may change: it is not part of what was committed.
         if path.is_file() and not path.is_symlink() and path not in {folder / FILES, folder / LABEL}:
             found[path.relative_to(folder).as_posix()] = file_entry(path)
     write_file(folder / FILES, _entries_adapter.dump_json(found))
@@ -91,7 +91,7 @@ def _read_made(place: Path) -> dict[str, FileEntry]:
 
 
 def read_entries(folder: Path) -> Mapping[str, FileEntry]:
-    """What `FILES` says of a folder: none where an earlier version of slrig finished the job; where it is gone or
+    """The entries of `FILES` in a folder: none where an earlier version of slrig finished the job; where it is gone or
     cannot be read, an impossible entry of itself, so that no damage keeps a service from its start.
     """
     try:
@@ -104,10 +104,10 @@ def read_entries(folder: Path) -> Mapping[str, FileEntry]:
 
 
 def damaged_files(folder: Path, *, digests: bool, names: Iterable[str] | None = None) -> dict[str, str]:
-    """What is wrong with files of a finished job, by their names: gone, of another length, changed. Files that `FILES`
-    does not name were made later, and are not looked at; nothing is where there is no `FILES`.
+    """Faults of the files of a finished job, by their names: gone, of another length, changed. Files that `FILES` does
+    not name were made later, and are not checked; without `FILES` nothing is.
 
-    digests : compare contents, too, which reads the files. names : those to look at; None for all.
+    digests : compare contents, too, which reads the files. names : those to check; None for all.
     """
     entries = read_entries(folder)
     if FILES in entries:
@@ -127,8 +127,8 @@ def damaged_files(folder: Path, *, digests: bool, names: Iterable[str] | None = 
 
 
 def check_files(root: Path) -> Iterator[tuple[str, str | None]]:
-    """Compare every file of the finished jobs of a data folder with what was committed, while a service runs or not:
-    each by its path in the folder, and what is wrong with it, None if nothing is.
+    """Compare every file of the finished jobs of a data folder with its committed digest, while a service runs or not:
+    path in the folder and fault, None if it is whole.
     """
     for entries in sorted(root.rglob(FILES)):
         place = entries.parent.relative_to(root)
@@ -150,10 +150,10 @@ def require_whole(place: Path, *names: str, remedy: str) -> None:
 
 
 def damage(what: str, found: Mapping[str, str], remedy: str) -> DamagedError:
-    """The error of files that are not as they were written. what : whose they are."""
+    """The error of files that are not as they were written. what : their owner, for the message."""
     named = [f"{name} {cause}" for name, cause in sorted(found.items())]
     more = f" and {len(named) - 3} more" if len(named) > 3 else ""
-    return DamagedError(f"{what}: {'; '.join(named[:3])}{more}. Look after the disk. {remedy}")
+    return DamagedError(f"{what}: {'; '.join(named[:3])}{more}. Check the disk. {remedy}")
 
 
 def free_bytes(folder: Path) -> int:
@@ -163,7 +163,7 @@ def free_bytes(folder: Path) -> int:
 
 class DataFolder:
     """The data folder, held by this process from construction until `release`, and closed to other users of the
-    machine, but for those of `group`, who may read it.
+    machine except those of `group`, who may read it.
 
     Raises
     ------
@@ -180,7 +180,7 @@ class DataFolder:
         self.naming = threading.Lock()
         with disk_errors(self.root):
             self.root.mkdir(parents=True, exist_ok=True)
-            # Whichever thread ends the service lets it go; a kernel that cannot lock is a refusal, not a makeshift.
+            # Any thread may end the service and release it; a kernel that cannot lock is refused, without a fallback.
             self._lock = FileLock(self.root / "lock", mode=0o600, thread_local=False, fallback_to_soft=False)
             try:
                 self._lock.acquire(blocking=False)
@@ -191,9 +191,9 @@ class DataFolder:
                 )
                 raise StorageError(message) from error
             try:
-                # Beside the lock: Windows lets nobody else read what is locked.
+                # A file of its own: Windows allows no other process to read a locked file.
                 (self.root / _HOLDER).write_text(f"{os.getpid()}\n", encoding="ascii")
-                # What somebody else uses is not touched.
+                # Permissions change only once the lock is held.
                 self._close_to_others(group)
                 for folder in (self.scans, self.calibrations, self.incoming):
                     folder.mkdir(exist_ok=True)
@@ -215,11 +215,11 @@ class DataFolder:
         except PermissionError as error:
             if group is not None:
                 message = (
-                    f"The data folder {self.root} cannot be given to the group '{group}': {error.strerror}. Let the "
-                    "user of the service own the folder and be in the group, or leave data_group out."
+                    f"The data folder {self.root} cannot be given to the group '{group}': {error.strerror}. Make the "
+                    "user of the service owner of the folder and member of the group, or leave data_group out."
                 )
                 raise StorageError(message) from error
-            # A disk without users, or somebody else's folder.
+            # A file system without users, or a folder of another user.
             _log.warning("other users of this machine may be able to read the data folder", folder=str(self.root))
 
     def _holder(self) -> str:
@@ -231,22 +231,22 @@ class DataFolder:
 
     @property
     def scans(self) -> Path:
-        """Where finished scans lie."""
+        """Folder of finished scans."""
         return self.root / SCANS
 
     @property
     def calibrations(self) -> Path:
-        """Where calibrations lie."""
+        """Folder of calibrations."""
         return self.root / "calibrations"
 
     @property
     def incoming(self) -> Path:
-        """Where scans, and what belongs to calibrations, are made."""
+        """Folder in which scans and files of calibrations are made."""
         return self.root / ".incoming"
 
     @property
     def orphans(self) -> Path:
-        """Where files without a record are put aside."""
+        """Folder of files without a record."""
         return self.root / ORPHANS
 
     @property
@@ -255,7 +255,7 @@ class DataFolder:
         return self.root / DATABASE
 
     def release(self) -> None:
-        """Let another process have the folder. Idempotent."""
+        """Release the folder for other processes. Idempotent."""
         self._lock.release()
 
     def require_present(self) -> None:
@@ -268,8 +268,8 @@ class DataFolder:
             raise DataFolderGoneError(message)
 
     def owns(self, path: Path) -> bool:
-        """Whether something lies at a path below one of the folders here, and no link leads to it. What the folders
-        themselves are is the operator's choice: `scans` may be a link to another disk.
+        """Whether a path exists below one of the folders here, and no link leads to it. The folders themselves may be
+        links: `scans` to another disk.
         """
         top, *below = path.relative_to(self.root).parts
         return path.exists() and path.resolve() == (self.root / top).resolve().joinpath(*below)
@@ -299,15 +299,15 @@ class DataFolder:
             raise StorageError(message)
 
     def scan(self, scan_id: UUID) -> Path:
-        """Where the files of a finished scan lie."""
+        """Folder of a finished scan."""
         return self.scans / str(scan_id)
 
     def staging(self, scan_id: UUID) -> Path:
-        """Where the files of a running scan are made."""
+        """Folder in which the files of a running scan are made."""
         return self.incoming / str(scan_id)
 
     def recording(self, scan_id: UUID) -> Path:
-        """Where a running scan's frames are recorded, until `keep_recording`."""
+        """Folder in which a running scan's frames are recorded, until `keep_recording`."""
         return self.staging(scan_id) / "recording"
 
     def keep_recording(self, scan_id: UUID) -> None:
@@ -319,7 +319,7 @@ class DataFolder:
             sync_folder(staged)
 
     def result(self, scan_id: UUID) -> Path:
-        """Where the files of a scan that is being reconstructed lie, once each is there."""
+        """Folder of the finished files of a scan that is being reconstructed."""
         return self.staging(scan_id) / RESULT
 
     def places(self, scan_id: UUID) -> tuple[Path, Path, Path]:
@@ -329,7 +329,7 @@ class DataFolder:
         return self.result(scan_id), self.staging(scan_id), self.scan(scan_id)
 
     def hidden(self, scan_id: UUID) -> str:
-        """What is left out of words that outlast the staging folder: where that lies."""
+        """Path prefix to remove from messages that outlast the staging folder."""
         return f"{self.staging(scan_id)}/"
 
     def stage(self, scan_id: UUID) -> Path:
@@ -340,7 +340,7 @@ class DataFolder:
         return folder
 
     def stage_bundle(self, job_id: UUID, place: Path) -> None:
-        """Stage a job that is over once more, with its bundle: links to the same files, which nobody changes."""
+        """Stage a finished job again, with its bundle: links to the same files, which never change."""
         staged = self.stage(job_id)
         with disk_errors(staged):
             shutil.copytree(place / BUNDLE, staged / BUNDLE, copy_function=os.link)
@@ -349,8 +349,8 @@ class DataFolder:
     def put(self, job_id: UUID, place: Path) -> None:
         """Move what is staged for a job to its place, by one rename, durable: all but a bundle, which is so already.
 
-        What could be fetched before lies beside the bundle then. What lies there of an attempt that was cut off before
-        its end was on record is removed.
+        Files that could be fetched before are next to the bundle then. Files there of an attempt that was interrupted
+        before its end was on record are removed.
         """
         staged = self.staging(job_id)
         with self.naming, disk_errors(staged):
@@ -370,14 +370,14 @@ class DataFolder:
         """Raise DamagedError unless files of a finished job are as they were committed. Each is read once, until it
         changes.
         """
-        looked = {}
+        stamps = {}
         for name in names:
             with suppress(OSError):
-                looked[place / name] = _stamp_of(place / name)
-        unknown = [each for each in names if self._whole.get(place / each) != looked.get(place / each, ())]
+                stamps[place / name] = _stamp_of(place / name)
+        unknown = [each for each in names if self._whole.get(place / each) != stamps.get(place / each, ())]
         if unknown:
             require_whole(place, *unknown, remedy="They are not given out.")
-        self._whole.update(looked)
+        self._whole.update(stamps)
 
     def note_made(self, place: Path, name: str) -> None:
         """Keep the digest of a file that was made on request in the folder of a finished job. Raises StorageError."""
@@ -405,11 +405,11 @@ class DataFolder:
         if entry is None or path.is_symlink():
             return False
         with suppress(OSError):
-            looked = _stamp_of(path)
-            if self._whole.get(path) == looked or file_entry(path) == entry:
-                self._whole[path] = looked
+            stamp = _stamp_of(path)
+            if self._whole.get(path) == stamp or file_entry(path) == entry:
+                self._whole[path] = stamp
                 return True
-        _log.warning("a file that was made on request is damaged, and made anew", file=str(path))
+        _log.warning("a file that was made on request is damaged, and made again", file=str(path))
         return False
 
     def remove(self, place: Path, trash: Path | None = None) -> None:
@@ -427,7 +427,7 @@ class DataFolder:
             shutil.rmtree(gone, ignore_errors=True)
 
     def put_aside(self, place: Path) -> None:
-        """Move files that no record knows to `orphans`, beside what was put there before. Raises StorageError."""
+        """Move files that no record knows to `orphans`, next to earlier ones. Raises StorageError."""
         above = place.parent.relative_to(self.root).parts
         name = place.name if above == (SCANS,) else "-".join([*above, place.name])
         with disk_errors(place):
@@ -471,17 +471,17 @@ class DataFolder:
 
     def _forget(self, place: Path) -> None:
         """Forget which files in a folder that goes were found whole."""
-        self._whole = {path: looked for path, looked in self._whole.items() if not path.is_relative_to(place)}
+        self._whole = {path: stamp for path, stamp in self._whole.items() if not path.is_relative_to(place)}
 
 
 def _stamp_of(path: Path) -> tuple[int, int, int]:
-    """What is another one once a file was changed or replaced. Raises OSError."""
+    """A value that differs once a file was changed or replaced. Raises OSError."""
     found = path.stat()
     return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def missing_files(place: Path, promised: Iterable[str]) -> list[str]:
-    """The promised files that are not in a folder. A link is no file and no folder of ours."""
+    """The promised files that are not in a folder. Links do not count as files or folders of ours."""
     is_ours = not place.is_symlink()
     return [name for name in promised if not (is_ours and (place / name).is_file() and not (place / name).is_symlink())]
 

@@ -1,7 +1,7 @@
 """The service's SQLite database and its tables: write-ahead log, synchronous FULL, so answers survive power cuts.
 
-A row that cannot be read is no error of those beside it; a damaged file is put aside, and what can be read of it is
-taken over.
+An unreadable row causes no error of other rows; a damaged file is moved aside, and its readable rows are copied into a
+new one.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Base(DeclarativeBase):
 class JobRow(Base):
     """One job of any kind. parent : the calibration or the acceptance test that it belongs to, if it belongs to one.
     pinned : no retention removes it. attempts : how often the worker began it. requested_by : the name of the key, or
-    the schedule, that asked for it.
+    the schedule, that requested it.
     """
 
     __tablename__ = "job"
@@ -224,7 +224,7 @@ class RunRow(Base):
 
 
 class VerificationRow(Base):
-    """What one verification, or one scan's redundancy, said of a calibration. `found` is `Verification.document`."""
+    """The verdict of a verification, or of a scan's redundancy, on a calibration. `found` : `Verification.document`."""
 
     __tablename__ = "verification"
 
@@ -252,7 +252,7 @@ _Read = TypeVar("_Read")
 
 
 class _UnreadableJson(dict[str, Any]):
-    """Stands for a text in a column of JSON that is none."""
+    """Represents a text in a column of JSON that is not JSON."""
 
 
 def _from_json(text: str | bytes) -> Any:
@@ -263,7 +263,7 @@ def _from_json(text: str | bytes) -> Any:
 
 
 def readable(rows: Iterable[_Row], read: Callable[[_Row], _Read]) -> Iterator[_Read]:
-    """What rows are, without those that `read` cannot read: the log has these."""
+    """Rows converted by `read`, without those that it cannot read: the log has these."""
     for row in rows:
         try:
             yield read(row)
@@ -303,7 +303,7 @@ def record_of(row: JobRow) -> JobRecord:
 def _readable_record(row: JobRow) -> JobRecord:
     for document in (row.plan, row.summary or {}):
         if isinstance(document, _UnreadableJson) or not isinstance(document, dict):
-            message = "a plan or a summary that is no JSON object"
+            message = "a plan or a summary that is not a JSON object"
             raise TypeError(message)
     return JobRecord(
         number=row.number,
@@ -326,7 +326,7 @@ def _readable_record(row: JobRow) -> JobRecord:
 
 
 def or_none(read: Callable[[str], _Read], text: str | None) -> _Read | None:
-    """What a text says; None where it cannot be read."""
+    """The value read from a text; None where it cannot be read."""
     try:
         return None if text is None else read(text)
     except (ValueError, TypeError, AttributeError):
@@ -338,11 +338,10 @@ def _moment(stamp: str | None) -> datetime | None:
 
 
 PATIENCE_S = 10.0
-"""How long a change waits for another program that has the file locked, as some backups do. A person who asked waits as
-long."""
+"""Longest wait of a change for another program that has the file locked, as some backups do. Requests wait as long."""
 
 PASSING_PATIENCE_S = 0.2
-"""How long a change waits that may be lost: the work waits meanwhile."""
+"""Longest wait of a change that may be lost: the work waits meanwhile."""
 
 _PATIENCE, _SYNCHRONOUS = "slrig_patience_ms", "slrig_synchronous"
 
@@ -350,8 +349,8 @@ _PATIENCE, _SYNCHRONOUS = "slrig_patience_ms", "slrig_synchronous"
 class Database:
     """The file with every record of the service, and its tables. Safe to call from any thread.
 
-    A change holds the file's one write lock from its first statement on: what it reads is what it changes, whatever
-    another thread or process does meanwhile.
+    A change holds the file's one write lock from its first statement on: no other thread or process changes what it
+    has read.
 
     aside : where a damaged file is moved; a new one takes its place, with what could be read of it.
 
@@ -373,20 +372,20 @@ class Database:
                 message = (
                     f"{path} was written by another version of slrig (its records are of version {unknown}), and this "
                     "one cannot read it. Move that file out of the data folder: finished scans and calibrations are "
-                    "found again by their own files, schedules have to be made anew. Or name another folder with "
+                    "found again by their own files, schedules have to be made again. Or name another folder with "
                     "--data."
                 )
                 raise StorageError(message)
         if found is not None:
             rows = _salvage(damaged, path)
             _log.error(
-                "the records were damaged; what could be read of them is taken over, and finished jobs come back by "
-                "their files: look after the disk, and make schedules anew that are gone",
+                "the records were damaged; what could be read of them is kept, and finished jobs come back by "
+                "their files: check the disk, and make missing schedules again",
                 cause=found, moved_to=str(damaged), rows=rows,
             )  # fmt: skip
 
     def close(self) -> None:
-        """Let the file go. Idempotent."""
+        """Close the file. Idempotent."""
         self._engine.dispose()
 
     @contextmanager
@@ -430,14 +429,14 @@ _DAMAGES = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 
 def _damage_of(path: Path) -> str | None:
-    """What makes a file useless as the database; None where it is sound, or not there."""
+    """The damage that makes a file useless as the database; None where it is sound, or not there."""
     if not path.is_file():
         return "it is a folder" if path.is_dir() else None
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True, timeout=PATIENCE_S)) as file:
             return next((text for (text,) in file.execute("PRAGMA quick_check(1)") if text != "ok"), None)
     except sqlite3.DatabaseError as error:
-        # Others, as of a disk that refuses or a file that is locked, are told by who opens it next.
+        # Other errors, as of a disk that refuses or a file that is locked, are raised when it is opened next.
         return str(error) if (getattr(error, "sqlite_errorcode", 0) & 0xFF) in _DAMAGES else None
 
 
@@ -492,9 +491,9 @@ def sqlite_engine(path: Path) -> Engine:
 
 
 def writing(engine: Engine, patience_s: float, synchronous: str = "FULL") -> Engine:
-    """The same file, whose transactions have its one write lock from their beginning; how long they wait for it.
+    """The same file, with transactions that take its one write lock at their beginning, or wait so long for it.
 
-    synchronous : of SQLite's words, which is the least that lasts through a power cut.
+    synchronous : of SQLite's settings, the weakest that survives a power cut.
     """
     return engine.execution_options(**{_PATIENCE: int(1000 * patience_s), _SYNCHRONOUS: synchronous})
 
@@ -513,10 +512,10 @@ def _set_up(connection: DBAPIConnection, _record: object) -> None:
 
 
 def _begin_log(cursor: DBAPICursor) -> None:
-    """Have the file keep a write-ahead log, as it does ever after.
+    """Switch the file to a write-ahead log, permanently.
 
-    Of programs that do so at the same moment SQLite refuses all but one at once, whatever its `busy_timeout`: those
-    hold locks that the one waits for. They let theirs go and ask again.
+    Of programs that do so at the same moment SQLite refuses all but one at once, despite its `busy_timeout`: those
+    hold locks that the one waits for. They release theirs and try again.
     """
     given_up = time.monotonic() + PATIENCE_S
     while True:
@@ -540,7 +539,7 @@ def _begin(connection: Connection) -> None:
 
 
 _VERSION = Table("alembic_version", MetaData(), Column("version_num", String(32), primary_key=True))
-"""Of the tables; named as by Alembic, which made them once."""
+"""Version of the tables; named as by Alembic, which made them once."""
 
 
 def upgrade(connection: Connection, tables: MetaData, changes: Mapping[str, Sequence[str]]) -> str:

@@ -1,4 +1,4 @@
-"""One kind of work: its plan, what it gets while it runs, how its progress and its frames get on, and its outcome."""
+"""One kind of work: its plan, its inputs while it runs, the transport of its progress and frames, and its outcome."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from slrig.jobs.store import JobStore
 
 LEAST_WAITING_BYTES, MOST_WAITING_BYTES = 128 * 2**20, 512 * 2**20
-"""How much of frames may wait for the reconstruction: a whole scan of a common camera where there is little memory, and
-where there is more, 40 frames of 12 megapixels: a line frame of those takes the reconstruction longer than the camera.
+"""Limits of the frames that wait for the reconstruction: a whole scan of a common camera where memory is short, else
+40 frames of 12 megapixels: a line frame of those takes the reconstruction longer than the camera.
 """
 _SHARE_OF_MEMORY = 1 / 16
 
@@ -46,7 +46,7 @@ def most_waiting_bytes() -> int:
 
 @dataclass(frozen=True, slots=True)
 class Begin:
-    """Frames of this header will come, and then what they have proven. region : what of the scene is asked for."""
+    """Frames of this header will come, and then their evidence. region : the requested part of the scene."""
 
     header: CaptureHeader
     calibration: Calibration
@@ -59,7 +59,7 @@ class Abandon:
 
 
 class FrameSink(Protocol):
-    """Is shown the frames of a capture as they are taken."""
+    """Receives the frames of a capture as they are taken."""
 
     def begin(self, header: CaptureHeader, calibration: Calibration | None) -> None:
         """Take note of what will come."""
@@ -77,9 +77,9 @@ class FrameSink(Protocol):
 class FrameFeed:
     """Sends the frames of one capture to the reconstruction process, on a thread of its own.
 
-    send : sends one message, and returns False when nobody receives it any more; it may block. number : of the task
-    that will use the frames. receiver : what they are sent to, by which the task's process is known. region : what of
-    the scene is asked for. `evidence` is what the frames have proven once all have come, whether they were sent or not.
+    send : sends one message, and returns False once the receiver is gone; it may block. number : of the task that will
+    use the frames. receiver : their destination, by which the task's process is known. region : the requested part of
+    the scene. `evidence` is that of all frames once they have come, whether they were sent or not.
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class FrameFeed:
         self._waiting.put(evidence)
 
     def abandon(self) -> None:
-        """Send no more, and have what was sent forgotten. After the end has been sent this does nothing."""
+        """Send no more, and discard what was sent. After the end has been sent this does nothing."""
         self._given_up.set()
         self._waiting.put(Abandon())
 
@@ -154,7 +154,7 @@ class FrameFeed:
         while True:
             message = self._waiting.get()
             if self._given_up.is_set():
-                self._waiting = queue.Queue()  # lets the frames go
+                self._waiting = queue.Queue()  # releases the frames
                 self._send(Abandon())
                 return
             if not self._send(message):
@@ -178,7 +178,7 @@ class FedCaptures:
         self._captures: dict[int, Any] = {}
 
     def hear(self, number: int, message: object) -> None:
-        """Take a message of a capture's feed. Frames that cannot be used are let go: reading the bundle shows why."""
+        """Take a message of a capture's feed. Frames that cannot be used are released: reading the bundle shows why."""
         if number not in self._captures:
             if self._captures and number < max(self._captures):
                 return
@@ -195,12 +195,12 @@ class FedCaptures:
                     live.end(message)
                 case Abandon():
                     self._captures[number] = None
-        except Exception as error:  # noqa: BLE001 - a head start that fails is no failure of the scan
+        except Exception as error:  # noqa: BLE001 - the scan does not depend on this head start
             _log.warning("frames could not be used while they were taken", cause=repr(error))
             self._captures[number] = None
 
     def taken(self, number: int) -> Any:
-        """What has taken the frames of a capture, None when nothing has; they are let go here."""
+        """The consumer of a capture's frames, None without one; it is released here."""
         return self._captures.pop(number, None)
 
 
@@ -250,7 +250,7 @@ class JobRun(Listener):
 
     @property
     def recording(self) -> Path:
-        """Where frames are recorded. It becomes `bundle` when all of them are on the disk."""
+        """Folder in which frames are recorded. It becomes `bundle` when all of them are on the disk."""
         return self.folder / "recording"
 
     @property
@@ -260,7 +260,7 @@ class JobRun(Listener):
 
     @property
     def result(self) -> Path:
-        """Where files are made that can be fetched at once: see `file_ready`. They belong next to the bundle."""
+        """Folder of files that can be fetched at once: see `file_ready`. They belong next to the bundle."""
         return self.folder / RESULT
 
 
@@ -334,7 +334,7 @@ class Job:
 
     @classmethod
     def place_of(cls, record: JobRecord, data: DataFolder) -> Path | None:
-        """Where the files of the job on record lie; of one whose plan cannot be read, what has its id for a name."""
+        """Folder of the files of a recorded job; if its plan cannot be read, the folder named by its id."""
         try:
             return cls.from_record(record).place(data, record.id)
         except (DamagedError, ValueError):
@@ -355,12 +355,12 @@ class Job:
         raise NotImplementedError
 
     def place(self, data: DataFolder, job_id: UUID) -> Path | None:  # noqa: ARG002 - for those that keep files
-        """Where its files belong; None where none are kept."""
+        """Folder of its files; None where none are kept."""
         return None
 
     @classmethod
     def places(cls, data: DataFolder) -> Iterable[Path]:  # noqa: ARG003
-        """Where files of jobs of this kind lie."""
+        """Folders of the files of jobs of this kind."""
         return ()
 
 
@@ -395,15 +395,15 @@ def due_s(job: Job) -> float:
 
 
 _LEAST_STEP = 0.01
-_LEAST_S = 0.1  # each is brought to disk, on the thread that captures; nobody sees more than ten a second
-_DETAIL_S = 2.0  # a person who looks on wants a sign every few seconds
+_LEAST_S = 0.1  # each is written to disk, on the thread that captures; people see no more than ten a second
+_DETAIL_S = 2.0  # people who watch want a sign every few seconds
 
 _log = structlog.get_logger(__name__)
 
 
 class ProgressRecorder:
-    """Takes progress from the work and records the steps worth telling: a new stage, a hundredth of the way, ten times
-    a second at most, the end, or another detail of a stage that goes on.
+    """Takes progress from the work and records the steps worth reporting: a new stage, a hundredth of the way, at
+    most ten times a second, the end, or another detail of a stage that goes on.
     """
 
     def __init__(
@@ -421,12 +421,12 @@ class ProgressRecorder:
         """
         self._attempt = attempt
         self._now_s = now_s
-        self._told_s = -math.inf
+        self._reported_s = -math.inf
         self._hidden = hidden
         self._store = store
         self._job_id = job_id
         self._start, self._end = span
-        self._told = JobProgress("", -1.0, "")
+        self._reported = JobProgress("", -1.0, "")
 
     def file_made(self, name: str) -> None:
         """Take note of a file that can be fetched before the job is over; a refusal fails no work, either."""
@@ -434,7 +434,7 @@ class ProgressRecorder:
 
     def captured(self) -> None:
         """Take note that the job needs the rig no longer; a refusal fails no work, either."""
-        self._recorded("that the rig is free of a job could not be told", lambda: self._store.captured(self._job_id))
+        self._recorded("the end of a job's capture could not be recorded", lambda: self._store.captured(self._job_id))
 
     def __call__(self, stage: str, fraction: float, detail: str) -> None:
         """Take note, as `Listener.report` does. A record that is refused fails no work: see the
@@ -442,16 +442,16 @@ class ProgressRecorder:
         """
         if self._attempt and not stage.startswith("waiting"):
             self._attempt = False
-            self._recorded("that a job begins could not be recorded", lambda: self._store.begin_attempt(self._job_id))
+            self._recorded("a job's start could not be recorded", lambda: self._store.begin_attempt(self._job_id))
         overall = self._start + (self._end - self._start) * min(max(fraction, 0.0), 1.0)
-        since_s = self._now_s() - self._told_s
-        goes_on = detail != self._told.detail and since_s >= _DETAIL_S
-        further = overall - self._told.fraction >= _LEAST_STEP and (since_s >= _LEAST_S or fraction >= 1)
-        if goes_on or stage != self._told.stage or further:
-            self._told = JobProgress(stage, overall, detail.replace(self._hidden, ""))
-            self._told_s = self._now_s()
+        since_s = self._now_s() - self._reported_s
+        goes_on = detail != self._reported.detail and since_s >= _DETAIL_S
+        further = overall - self._reported.fraction >= _LEAST_STEP and (since_s >= _LEAST_S or fraction >= 1)
+        if goes_on or stage != self._reported.stage or further:
+            self._reported = JobProgress(stage, overall, detail.replace(self._hidden, ""))
+            self._reported_s = self._now_s()
             self._recorded(
-                "how far a job is could not be recorded", lambda: self._store.progress(self._job_id, self._told)
+                "a job's progress could not be recorded", lambda: self._store.progress(self._job_id, self._reported)
             )
 
     def _recorded(self, refused: str, record: Callable[[], None]) -> None:

@@ -47,7 +47,7 @@ class Listener:
         self.check()
 
     def within(self, begin: float, end: float, name: str = "") -> Listener:
-        """Of a call that is this one's part from one fraction to another. name : goes before its stages."""
+        """A listener for the part of this call from one fraction to another. name : prefix of its stages."""
 
         def report(stage: str, fraction: float, detail: str) -> None:
             whole = begin + (end - begin) * min(max(fraction, 0.0), 1.0)
@@ -56,7 +56,7 @@ class Listener:
         return Listener(report=report, cancelled=self.cancelled)
 
     def part(self, number: int, count: int, name: str = "") -> Listener:
-        """Of one of `count` calls that make up this one, alike long. number : from 0."""
+        """A listener for one of `count` equally long calls that make up this one. number : from 0."""
         return self.within(number / count, (number + 1) / count, name)
 
 

@@ -1,6 +1,6 @@
 """Runs jobs: one at a time with the rig, others compute meanwhile; each job is on record with one end.
 
-A job whose light is over leaves the rig to the next one. Pictures for those who aim come in between.
+A job whose capture is over leaves the rig to the next one. Previews are taken in between.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ RETRY_S = 2.0
 MAX_ATTEMPTS = 3
 """So often the worker begins a job, where the worker or the service ends before the job."""
 
-_LOOK_S = 0.1
-"""How often a drain looks whether it is over, or to be cut short."""
+_POLL_S = 0.1
+"""Interval at which a drain checks whether it is over, or aborted."""
 
 _log = structlog.get_logger(__name__)
 
@@ -71,7 +71,7 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True, slots=True)
 class RigStatus:
-    """The rig as far as it is known, who holds it since when, how many wait, and what computes.
+    """The rig's state as last known, its holder and since when, how many jobs wait, and which compute.
 
     active : the calibration that takes the place of the rig's own; misfit : why it cannot be used. holder, and those of
     computing : `Holder.name`. opening : what the rig's driver said last while it is opened. reconstruction :
@@ -97,9 +97,9 @@ class RigStatus:
 
 @dataclass(slots=True, eq=False)
 class _Work:
-    """A job that waits or is under way. Its first end stands.
+    """A job that waits or is under way. Only its first end counts.
 
-    by : who asked for it. captured : its frames are taken, and it is to compute. resumable : whether the next start
+    by : who requested it. captured : its frames are taken, and it is to compute. resumable : whether the next start
     goes on with it. stop : set when it is to end early. error : by which it ended, once `ended`. outcome : what it
     found. worked : nothing of it is under way any more. dismissed : its group knows that it came to nothing.
     """
@@ -126,7 +126,7 @@ class _Work:
 
 @dataclass(frozen=True, slots=True)
 class _NoJob(Job):
-    """Stands for what uses the rig for some seconds, and is on no record."""
+    """Represents a use of the rig for some seconds that is not on record."""
 
     kind: ClassVar[JobKind] = JobKind.SCAN
     computes: ClassVar[bool] = False
@@ -181,7 +181,7 @@ class JobManager:
         self._spare_bytes = spare_bytes
         self._give_up = give_up
         self._changed = threading.Condition()
-        # Replaced, never changed: previews look at it without the lock.
+        # Replaced, never changed: previews read it without the lock.
         self._waiting: tuple[_Work, ...] = ()
         self._active: _Work | None = None
         self._computing: list[_Work] = []
@@ -219,7 +219,7 @@ class JobManager:
     ) -> list[JobRecord]:
         """Put jobs of one kind on record, all or none, and line them up in their order. Returns at once.
 
-        wait : the first may stand behind other jobs. key : the idempotency key of the request, reserved. holder : whom
+        wait : the first may wait behind other jobs. key : the idempotency key of the request, reserved. holder : whom
         a refusal names meanwhile; None the job. first : called once a place in the line is certain, before anything is
         on record.
 
@@ -251,7 +251,7 @@ class JobManager:
         return records
 
     def lend(self, holder: Holder, use: Callable[[RigSession, Listener], _Result]) -> _Result:
-        """Have the rig used on its thread for some seconds, now or not at all, and return what came of it.
+        """Use the rig on its thread for some seconds, now or not at all, and return the result.
 
         use : is given the rig, to be opened, and who says whether it is to end early. Nothing is on record. Raises what
         that raises, and RigBusyError and DeviceError as `submit`.
@@ -287,19 +287,19 @@ class JobManager:
         return records
 
     def begin(self, job: Job, record: JobRecord, *, captured: bool = False, holder: Holder | None = None) -> None:
-        """Have a job done that is on record, however many wait. captured : its frames are there."""
+        """Line up a job that is on record, however many wait. captured : its frames are there."""
         with self._changed:
             self._line_up([self._work(job, record, holder, captured=captured)])
 
-    def compute_again(self, job_id: UUID, asked: Job | None = None) -> JobRecord:
-        """Have a finished job computed once more from its bundle; what comes of it takes the place of its files then.
-        asked : what is computed in place of what is on record.
+    def compute_again(self, job_id: UUID, instead: Job | None = None) -> JobRecord:
+        """Compute a finished job again from its bundle; the result then replaces its files. instead : computed in place
+        of the job on record.
 
         Raises JobNotFoundError; ScanStateError where it is not over, or of a kind that is not computed from its bundle
         alone; ArtefactNotReadyError without a bundle; DamagedError where that is damaged; StorageError.
         """
         record = self.store.get(job_id)
-        job = asked or self.kinds[record.kind].from_record(record)
+        job = instead or self.kinds[record.kind].from_record(record)
         place = job.place(self.data, job_id)
         if not record.state.final or not job.movable or place is None:
             message = f"{record.kind.capitalize()} {job_id} is {record.state}, and cannot be computed again."
@@ -314,13 +314,13 @@ class JobManager:
         with self._changed:
             if self._ending:
                 raise interruption_error()
-            self.store.replan(job_id, record.plan if asked is None else asked.document())
+            self.store.replan(job_id, record.plan if instead is None else instead.document())
             self.store.advance(job_id, JobState.COMPUTING)
         self.begin(job, record, captured=True)
         return self.store.get(job_id)
 
     def cancel(self, job_id: UUID) -> JobRecord:
-        """Ask a job to end early, and return it at once; one that is over stays so. Raises JobNotFoundError."""
+        """Request a job's early end, and return it at once; one that is over stays so. Raises JobNotFoundError."""
         with self._changed:
             queued = next((work for work in self._waiting if work.id == job_id), None)
             if queued is not None:
@@ -344,15 +344,15 @@ class JobManager:
         """Return a job once it is over and its end on record, or after so long as it is then."""
         over = threading.Event()
 
-        def look() -> None:
+        def check() -> None:
             with suppress(JobNotFoundError):
                 if not self.store.get(job_id).state.final:
                     return
             over.set()
 
-        unwatch = self.store.watch(job_id, look)
+        unwatch = self.store.watch(job_id, check)
         try:
-            look()
+            check()
             over.wait(timeout_s)
         finally:
             unwatch()
@@ -382,7 +382,7 @@ class JobManager:
         _log.info("job deleted", kind=str(record.kind), job=str(job_id))
 
     def watch(self, camera: str, light: Light, exposure_s: float | None = None) -> Watch:
-        """Look through a camera; pictures come while the rig is idle, and wait while it is held. exposure_s : see
+        """Preview of a camera; pictures come while the rig is idle, and wait while it is held. exposure_s : see
         `Previews.watch`.
 
         Raises
@@ -444,13 +444,13 @@ class JobManager:
         with self._changed:
             self._ending = True
             while self._under_way() and not hurry.is_set() and time.monotonic() < give_up:
-                self._changed.wait(_LOOK_S)
+                self._changed.wait(_POLL_S)
 
     def close(self, *, timeout_s: float = 3.0) -> None:
         """End what is under way, darken and close the rig, and record what was cut off. Idempotent.
 
         A driver that does not return in `timeout_s` is left behind: the projector is made dark from another thread, as
-        far as the driver lets, and its job is recorded all the same.
+        far as the driver allows, and its job is recorded all the same.
         """
         with self._closing:
             if self._closed:
@@ -483,7 +483,7 @@ class JobManager:
         self._changed.notify_all()
 
     def _require_place(self, *, wait: bool) -> None:
-        """Raise unless a job that needs the rig may stand in line; with the lock held."""
+        """Raise unless a job that needs the rig may wait in line; with the lock held."""
         self._require_serving()
         waiting = self._due()
         ahead = self._active or (waiting[0] if waiting else None)
@@ -509,7 +509,7 @@ class JobManager:
         return [work for work in self._waiting if work.due_s <= now_s]
 
     def _until_due_s(self) -> float | None:
-        """How long no further job becomes due; None where none waits for its time."""
+        """Seconds until the next job becomes due; None where none waits for its time."""
         now_s = time.monotonic()
         return min((work.due_s - now_s for work in self._waiting if work.due_s > now_s), default=None)
 
@@ -540,7 +540,7 @@ class JobManager:
             except BaseException:  # noqa: BLE001 - see above
                 _log.exception("the end of work with the rig went wrong")
                 # Not at once again, where that is what fails.
-                time.sleep(_LOOK_S)
+                time.sleep(_POLL_S)
         self.rig.darken()
         self.rig.let_go()
 
@@ -562,7 +562,7 @@ class JobManager:
         return self.live.wanted or self._previews.wanted
 
     def _run(self, work: _Work) -> None:
-        """The first part of a job, and what comes to be of it."""
+        """Run the first part of a job, and pass it on or end it."""
         # An error that ends the thread is not a success.
         error: Exception | None = RuntimeError("the thread that owns the rig was ended")
         goes_on = False
@@ -637,7 +637,7 @@ class JobManager:
         return True
 
     def _show(self) -> None:
-        """Play live depth, or else take pictures for those who look, until a job wants the rig."""
+        """Play live depth, or else take previews, until a job needs the rig."""
         try:
             rig = self.rig.open()
             with driver_errors(self.rig.name):
@@ -679,7 +679,7 @@ class JobManager:
                 error = interruption_error() if self._ending else as_error(raised)
             self._clear_up(work, error)
         except Exception:  # noqa: BLE001 - as on the owner thread
-            _log.exception("the end of work that computes went wrong", work=work.holder.words)
+            _log.exception("the end of work that computes went wrong", work=work.holder.label)
         finally:
             with self._changed:
                 self._computing.remove(work)
@@ -766,7 +766,7 @@ class JobManager:
         return ProgressRecorder(self.store, work.id, hidden=hidden, span=(begin, end), attempt=attempt)
 
     def _follow(self, work: _Work) -> None:
-        """Have those jobs done that follow one whose frames are taken."""
+        """Line up the jobs that follow one whose frames are taken."""
         group = self.groups.get(work.job.kind)
         if group is not None:
             with _unharmed(work), acting_as(work.by):
@@ -805,7 +805,7 @@ class JobManager:
             self.data.keep_bundle(job_id, place)
 
     def _dismiss(self, work: _Work) -> None:
-        """Have the group of a job know, once, that it came to nothing, and the worker be ready for the next."""
+        """Tell the group of a job, once, that it came to nothing, and get the worker ready for the next."""
         if work.dismissed:
             return
         work.dismissed = True
@@ -943,7 +943,7 @@ class JobManager:
 
     def _join(self, timeout_s: float) -> None:
         """Wait for the owner thread, which darkens and closes the rig, and for what computes; an owner that hangs is
-        left behind, and darkened past, as far as its driver lets.
+        left behind, and the projector darkened from here, as far as its driver allows.
         """
         give_up = time.monotonic() + timeout_s
         if self._owner.is_alive():
@@ -962,7 +962,7 @@ def _goes_on(work: _Work, error: Exception) -> bool:
 
 
 def _end_by(error: Exception, job_id: UUID, *, hidden: str) -> _End:
-    """How a job ends by an error, which the log has unless somebody wanted it.
+    """The end of a job by an error, which is logged unless a person caused it.
 
     hidden : left out of its message. The staging folder is gone when that is read.
     """
@@ -994,7 +994,7 @@ def _busy(work: _Work) -> RigBusyError:
     since, holder = work.since.isoformat(timespec="seconds"), work.holder
     cancel = "" if holder.path is None else f"cancel it with POST {holder.path}/cancel, "
     message = (
-        f'The rig is held by {holder.words} since {since}. Wait for it, {cancel}or send "if_busy": "queue" to wait '
+        f'The rig is held by {holder.label} since {since}. Wait for it, {cancel}or send "if_busy": "queue" to wait '
         "in line."
     )
     return RigBusyError(message, holder=holder.name, since=since)

@@ -1,4 +1,4 @@
-"""What is on record about a job of any kind: frozen values, and the clock that dates them."""
+"""Records of jobs of any kind: frozen values, and the clock that dates them."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from slrig.errors import DamagedError, QueueFullError
 from slrig.failure import JobFailure
 
 RECORD = "record.json"
-"""The file beside those of a finished job that has its record."""
+"""The file next to those of a finished job that has its record."""
 
 LABEL = "label.json"
-"""The file beside the record that has the label which the job was given since: a JSON string, or null."""
+"""The file next to the record with the job's later label: a JSON string, or null."""
 
 Clock = Callable[[], datetime]
 """Gives the present moment with a time zone."""
@@ -44,8 +44,8 @@ _actor_key: ContextVar[str] = ContextVar("actor_key", default="")
 
 @contextmanager
 def acting_as(name: str | None, *, key: str = "") -> Iterator[None]:
-    """Jobs that are made within the block, on this thread or one that it waits for, were asked for by `name`. key :
-    digest of the key that they were asked for with; "" where there is none.
+    """Record `name` as the requester of jobs made within the block, on this thread or one that it waits for. key :
+    digest of the requester's key; "" where there is none.
     """
     before, before_key = _actor.set(name), _actor_key.set(key)
     try:
@@ -56,12 +56,12 @@ def acting_as(name: str | None, *, key: str = "") -> Iterator[None]:
 
 
 def actor_key() -> str:
-    """Digest of the key that what is being made now is asked for with; "" where there is none."""
+    """Digest of the key of the current request; "" where there is none."""
     return _actor_key.get()
 
 
 def actor() -> str | None:
-    """Who asks for what is being made now."""
+    """Name of the current requester."""
     return _actor.get()
 
 
@@ -84,18 +84,18 @@ def has_share(total: int, who: str | None, holders: Collection[str | None]) -> b
 
 
 def require_share(what: str, total: int, holders: Collection[str | None]) -> None:
-    """Raise QueueFullError unless whoever asks now may have one more of so many places of a line."""
+    """Raise QueueFullError unless the current requester may have one more of so many places of a line."""
     if not has_share(total, actor(), holders):
         own = sum(each == actor() for each in holders)
         message = (
-            f"{len(holders)} of {total} places {what} are taken, {own} of them by you, and nobody gets more than are "
+            f"{len(holders)} of {total} places {what} are taken, {own} of them by you, and no one gets more than are "
             "left for all others. Try again later."
         )
         raise QueueFullError(message)
 
 
 class JobKind(StrEnum):
-    """What a job is."""
+    """The kinds of jobs."""
 
     SCAN = "scan"
     VERIFICATION = "verification"
@@ -126,7 +126,7 @@ _PATHS = {JobKind.SCAN: "/scan", JobKind.MODEL: "/model", JobKind.VERIFICATION: 
 
 
 class JobState(StrEnum):
-    """Where a job stands. The last four are final: a job never leaves them."""
+    """State of a job. The last four are final: a job never leaves them."""
 
     QUEUED = "queued"
     CAPTURING = "capturing"
@@ -161,12 +161,12 @@ class JobProgress:
 
 @dataclass(frozen=True, slots=True)
 class JobRecord:
-    """One job. `number` rises with every job and orders lists; times are UTC. plan : what was asked, as JSON values.
+    """One job. `number` rises with every job and orders lists; times are UTC. plan : the request, as JSON values.
 
-    parent : the calibration of a pose or a solve, the acceptance test of a position. summary : what came of it, as far
-    as a list shows it; None before. pinned : no retention removes it.
-    requested_by : the name of the key, or the schedule, that asked for it, where that is known. has_files_json : beside
-    its files, whether `files.json` was written with it.
+    parent : the calibration of a pose or a solve, the acceptance test of a position. summary : the part of its result
+    that a list shows; None before. pinned : no retention removes it.
+    requested_by : the name of the key, or the schedule, that requested it, where that is known. has_files_json : of a
+    record next to its files, whether `files.json` was written with it.
     """
 
     number: int
@@ -216,28 +216,28 @@ def write_label(folder: Path, label: str | None) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """Who holds the rig. name : what an answer calls it, the id of a scan; words : the same for a person; path : where
-    it is found over HTTP, below which `cancel` ends it; None for what is over in seconds.
+    """Holder of the rig. name : its name in an answer, the id of a scan; label : the same for a person; path : its HTTP
+    path, below which `cancel` ends it; None for what is over in seconds.
     """
 
     name: str
-    words: str
+    label: str
     path: str | None
 
 
 def holder_of(record: JobRecord) -> Holder:
-    """Who holds the rig for a job."""
+    """The holder of the rig for a job."""
     job, group = f"{record.kind} {record.id}", record.parent
     match record.kind:
         case JobKind.POSE:
-            words = f"calibration {group}, pose {record.plan['number']}"
-            return Holder(words, words, f"/calibration/{group}/pose/{record.plan['number']}")
+            label = f"calibration {group}, pose {record.plan['number']}"
+            return Holder(label, label, f"/calibration/{group}/pose/{record.plan['number']}")
         case JobKind.SOLVE:
-            words = f"calibration {group}, solve {record.plan['number']}"
-            return Holder(words, words, f"/calibration/{group}")
+            label = f"calibration {group}, solve {record.plan['number']}"
+            return Holder(label, label, f"/calibration/{group}")
         case JobKind.POSITION:
-            words = f"acceptance test {group}"
-            return Holder(words, words, f"/acceptance/{group}")
+            label = f"acceptance test {group}"
+            return Holder(label, label, f"/acceptance/{group}")
         case kind:
             name = str(record.id) if kind is JobKind.SCAN else job
             return Holder(name, job, f"{kind.path}/{record.id}")
@@ -249,11 +249,11 @@ _PARENTS = {
     JobKind.SOLVE: ("calibration", "/calibration"),
     JobKind.POSITION: ("acceptance", "/acceptance"),
 }
-"""What the parent of a job of each kind is, and where the service has those."""
+"""Name and HTTP path of the parent of a job of each kind."""
 
 
 def reference(job: JobRecord) -> dict[str, Any]:
-    """What names a job to those who follow jobs of all kinds: `id`, `kind`, `label`, the `series`, `calibration` or
+    """Description of a job in events of all kinds of jobs: `id`, `kind`, `label`, the `series`, `calibration` or
     `acceptance` that it belongs to, if it belongs to one, and `links`, by paths of the service.
     """
     named: dict[str, Any] = {"id": str(job.id), "kind": str(job.kind), "label": job.label}
@@ -275,7 +275,7 @@ def reference(job: JobRecord) -> dict[str, Any]:
 @dataclass(frozen=True, slots=True)
 class JobEvent:
     """One thing that happened to a job. `number` rises and never changes: it counts from 1 within the job, or, where
-    all jobs of one parent are followed, over all events on record. job : whose it is.
+    all jobs of one parent are followed, over all events on record. job : its id.
     """
 
     number: int
@@ -285,12 +285,12 @@ class JobEvent:
 
 
 def stamp(moment: datetime) -> str:
-    """A moment as it stands on record."""
+    """A moment as it is recorded."""
     return moment.isoformat(timespec="milliseconds")
 
 
 STAGES_S = "stages_s"
-"""Where the summary of a job has the seconds of each stage of its computation, in their order."""
+"""Key of a job's summary with the seconds of each stage of its computation, in their order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,15 +304,15 @@ class Stage:
 
     @property
     def seconds(self) -> float:
-        """How long it took."""
+        """Duration."""
         return (self.end - self.begin).total_seconds()
 
 
 def stages_of(record: JobRecord, events: Sequence[JobEvent]) -> Iterator[Stage]:
     """The states that an ended job was in, and below `computing` the stages of the computation, one after the other.
 
-    Of those only the seconds are known: a stage that was entered twice is one here, and what was computed while frames
-    still came lies a little late.
+    Of those only the seconds are known: a stage that was entered twice is one here, and computations while frames
+    still came are dated a little late.
     """
     changes = [
         (event.data["state"], datetime.fromisoformat(event.data["time"])) for event in events if _is_state(event)
@@ -343,8 +343,8 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 @cache
 def versions() -> Mapping[str, str]:
-    """By name: of slrig and the libraries that it computes with, `code`, a hash of slrig's own files, which tells two
-    states of one version apart, and `machine`, the kind of processor. Where all are equal, so are the bytes of a mesh.
+    """Versions by name: of slrig and the libraries that it computes with, `code`, a hash of slrig's own files, which
+    differs within one version, and `machine`, the kind of processor. Where all are equal, so are the bytes of a mesh.
     """
     code = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):

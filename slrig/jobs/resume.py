@@ -1,4 +1,4 @@
-"""The first step of a start: make records and files of the last run agree, however it ended."""
+"""The first step of a start: make the records and files of the last run agree."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from slrig.jobs.manager import MAX_ATTEMPTS, JobManager
 from slrig.jobs.records import JobRecord, JobState, acting_as, read_record
 
 MAX_TAKES = 10
-"""So often a job is lined up to be computed at most, where something ends the service before the worker begins it."""
+"""Most times that a job is lined up to be computed, where something ends the service before the worker begins it."""
 
 _log = structlog.get_logger(__name__)
 
 
 def resume(manager: JobManager) -> None:
-    """Settle every job that the last run left open, or have it go on. Once, before the manager starts.
+    """End or continue every job that the last run left open. Once, before the manager starts.
 
     - A job whose files are in their place had only its end missing on record.
     - One that waited waits again. One that computed, or waited for that, is computed from the frames that it has, until
-      the worker has begun it `MAX_ATTEMPTS` times: what ended the service each time may lie in those.
+      the worker has begun it `MAX_ATTEMPTS` times: those frames may be what ended the service each time.
     - Any other was interrupted; its frames are kept if it keeps them and all had come.
     - A deletion that was cut off is completed.
     - A job that succeeded and lacks files is recorded as failed.
@@ -58,7 +58,7 @@ def resume(manager: JobManager) -> None:
 
 
 def _went_on(manager: JobManager, record: JobRecord, job: Job) -> bool:
-    """Have a job go on, or settle it; return whether it goes on."""
+    """Continue a job, or end it; return whether it continues."""
     store, data = manager.store, manager.data
     place, group = job.place(data, record.id), manager.groups.get(record.kind)
     kept = None if place is None else read_record(place)
@@ -106,8 +106,8 @@ def _require_files(manager: JobManager, record: JobRecord) -> None:
         return
     found = {**damaged_files(place, digests=False), **dict.fromkeys(missing, "is gone")}
     if found:
-        anew = job.movable and data.owns(place / BUNDLE)
-        remedy = f"POST {record.kind.path}/{record.id}/reconstruct makes them anew." if anew else job.remedy
+        again = job.movable and data.owns(place / BUNDLE)
+        remedy = f"POST {record.kind.path}/{record.id}/reconstruct makes them again." if again else job.remedy
         store.lose_files(
             record.id, job_failure(damage(f"Files in {place.relative_to(data.root)} are damaged", found, remedy))
         )
@@ -143,7 +143,7 @@ def _restore(manager: JobManager, kind: type[Job], unreadable: set[UUID]) -> Non
 
 
 def _belongs(manager: JobManager, kept: JobRecord, place: Path) -> bool:
-    """Whether a record says that its files lie where it was found."""
+    """Whether a record was found in the folder where its files belong."""
     try:
         return manager.kinds[kept.kind].from_record(kept).place(manager.data, kept.id) == place
     except (KeyError, ValueError):

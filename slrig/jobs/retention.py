@@ -1,4 +1,4 @@
-"""What is removed by itself, and when, where the settings set limits: old jobs and calibrations.
+"""Automatic removal of old jobs and calibrations, by the limits of the settings.
 
 DATA/.trash/SECOND-KIND-ID    what was removed less than a day of the service ago; moved back to its place it is on
                               record again after the next start
@@ -37,34 +37,34 @@ from slrig.jobs.store import Audit
 CLOCK = "clock.json"
 """In the data folder: the state of a `SteadyClock`."""
 
-LOOK_S = 3600.0
-"""How often ages are looked at; counts and sizes are after each job, too."""
+CHECK_S = 3600.0
+"""Interval of the check of ages; counts and sizes are checked after each job, too."""
 
 READ_S = 900.0
-"""How long after somebody asked for a file of a job it counts as in use: 15 minutes carry a bundle of 2 GB over a
-network of 20 Mbit/s."""
+"""Time after a request for a file of a job in which the job counts as in use: 15 minutes carry a bundle of 2 GB over
+a network of 20 Mbit/s."""
 
 MAX_JUMP = timedelta(days=1)
 """By so much the system's clock may differ from where it was, and the time since, before it is doubted."""
 
 DOUBT_S = 7 * 86400.0
-"""How long the service has to run before it believes a clock that jumped by more."""
+"""Time that the service has to run before it accepts a clock that jumped by more."""
 
 TRASH, TRASH_S = ".trash", 86400.0
-"""Where what was removed lies in the data folder, and for how many seconds in which the service runs."""
+"""Folder of removed files in the data folder, and how long they stay there, in seconds in which the service runs."""
 
 _WRITE_S = 60.0
-"""How often the state of a clock is written at most, while nothing is doubted."""
+"""Least interval between writes of a clock's state, while no jump is in doubt."""
 
 _END_S = 1.0
-"""How long the end of the service waits for a removal under way; the next start completes one that is cut off."""
+"""Longest wait of the service's end for a removal under way; the next start completes an interrupted one."""
 
 _log = structlog.get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """How many jobs of a kind are kept; None sets no limit. days : since a job ended. size_bytes : of all files."""
+    """Limits of the jobs of a kind that are kept; None for no limit. days : since a job ended. size_bytes : of all."""
 
     count: int | None = None
     days: float | None = None
@@ -72,14 +72,12 @@ class Limits:
 
     @property
     def any(self) -> bool:
-        """Whether there is one."""
+        """Whether a limit is set."""
         return (self.count, self.days, self.size_bytes) != (None, None, None)
 
 
 class _ClockState(BaseModel, extra="forbid"):
-    """What is kept of a `SteadyClock`: the time that it believes, for how long the system's has differed, and how long
-    services have run.
-    """
+    """State of a `SteadyClock`: its time, for how long the system's has differed, and how long services have run."""
 
     time: datetime
     doubt_s: float
@@ -170,7 +168,7 @@ class Archive(Protocol):
 
     @property
     def kind(self) -> str:
-        """What its path and its settings call it."""
+        """Its name in its path and its settings."""
         ...
 
     def kept(self) -> Sequence[Kept]:
@@ -252,23 +250,23 @@ class Retention:
         self._thread = LastingThread(self._keep_on, "slrig-retention")
 
     def start(self) -> None:
-        """Look at all now and every hour, and at a kind after `look`. Does nothing without limits and trash."""
+        """Check all now and every hour, and a kind after `check`. Does nothing without limits and trash."""
         if self._trash.is_dir() or any(limits.any for _, limits in self._archives.values()):
             self._thread.start()
 
-    def look(self, kind: str) -> None:
-        """Have the limits of a kind looked at soon. Returns at once."""
+    def check(self, kind: str) -> None:
+        """Request a check of the limits of a kind. Returns at once."""
         if kind in self._archives:
             with self._due:
                 self._kinds.add(kind)
                 self._due.notify()
 
     def reading(self, item: UUID) -> None:
-        """Take note that somebody asks for a file."""
+        """Note a request for a file."""
         self._read_s[item] = self._now_s()
 
     def close(self) -> None:
-        """Look no more. Idempotent."""
+        """Stop. Idempotent."""
         with self._due:
             self._closed = True
             self._due.notify()
@@ -278,14 +276,14 @@ class Retention:
     def _keep_on(self) -> None:
         while not self._closed:
             with self._due:
-                self._due.wait_for(lambda: self._closed or self._kinds, LOOK_S)
+                self._due.wait_for(lambda: self._closed or self._kinds, CHECK_S)
                 # After an hour without a job, all.
                 kinds, self._kinds = self._kinds or set(self._archives), set()
             if not self._closed:
                 try:
                     self.apply(kinds)
                 except Exception:  # noqa: BLE001 - a disk that refuses now may answer in an hour
-                    _log.exception("what is old could not be looked for")
+                    _log.exception("the limits of the settings could not be checked")
 
     def apply(self, kinds: Collection[str] | None = None) -> Sequence[UUID]:
         """Remove what is beyond the limits of kinds, None for all, say so in log and audit, and return which."""
@@ -308,7 +306,7 @@ class Retention:
                 self._trash.mkdir(exist_ok=True)
             archive.remove(old.id, self._trash / f"{self._clock.ran_s:.0f}-{archive.kind}-{old.id}")
         except (JobNotFoundError, ScanStateError, CalibrationNotFoundError, CalibrationStateError):
-            # Deleted by somebody meanwhile, or in use.
+            # Deleted by a request meanwhile, or in use.
             return False
         except StorageError as error:
             _log.warning("what is old could not be removed", kind=archive.kind, id=str(old.id), cause=str(error))
@@ -323,13 +321,13 @@ class Retention:
         for place in self._trash.iterdir() if self._trash.is_dir() else ():
             since, _, name = place.name.partition("-")
             if not since.isdecimal() or float(since) > ran_s:
-                # Somebody's own, or of a clock whose state was lost: its day begins now.
+                # Put there by a person, or by a clock that lost its state: its day begins now.
                 place.rename(self._trash / f"{ran_s:.0f}-{name or place.name}")
             elif ran_s - float(since) > TRASH_S:
                 remove(place)
 
     def _beyond(self, archive: Archive, limits: Limits, now: datetime) -> Iterator[tuple[Kept, str]]:
-        """What to remove, and why: first what failed, oldest first. What is kept whatever it is counts, too."""
+        """Jobs to remove, each with the reason: failed ones first, then the oldest. Pinned ones count, too."""
         kept = archive.kept()
         ended = _ends(kept)
         size_bytes = 0
@@ -355,7 +353,7 @@ def _why(limits: Limits, kind: str, count: int, age: timedelta, size_bytes: int)
 
 
 def _ends(kept: Sequence[Kept]) -> dict[UUID, datetime]:
-    """When each ended. One that was begun later did not end before earlier ones were begun, whatever a clock said."""
+    """End of each. A later job did not end before earlier ones were begun, even where a clock says so."""
     ends: dict[UUID, datetime] = {}
     latest = None
     for each in reversed(kept):

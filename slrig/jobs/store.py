@@ -49,14 +49,14 @@ from slrig.jobs.records import (
 
 @dataclass(frozen=True, slots=True)
 class CatalogueCopy:
-    """What a catalogue is told of a job that ended. number : the order in which jobs ended. job : JSON values."""
+    """A catalogue's entry of a job that ended. number : the order in which jobs ended. job : JSON values."""
 
     number: int
     job: Mapping[str, Any]
 
 
 class Copies:
-    """What waits to be copied, from old to new. Any thread may call. `news` is set when one more waits."""
+    """Jobs that wait to be copied, from old to new. Any thread may call. `news` is set when one more waits."""
 
     def __init__(self, database: Database, *, clock: Clock = utc_now) -> None:
         self._database = database
@@ -64,8 +64,8 @@ class Copies:
         self.news = threading.Event()
 
     def put(self, session: Session, job: JobRecord) -> None:
-        """Have a job copied once the session's changes are kept."""
-        session.add(CopyRow(at=stamp(self._clock()), job_id=str(job.id), body=told(job)))
+        """Queue a copy of a job once the session's changes are committed."""
+        session.add(CopyRow(at=stamp(self._clock()), job_id=str(job.id), body=catalogue_entry(job)))
         event.listen(session, "after_commit", lambda _: self.news.set(), once=True)
 
     def oldest(self, limit: int) -> Sequence[CatalogueCopy]:
@@ -96,14 +96,14 @@ class Copies:
             return list(session.scalars(query))
 
     def of(self, ids: Collection[str]) -> Sequence[Mapping[str, Any]]:
-        """What a catalogue is told of these, as far as they are on record, in the order in which they ended."""
+        """Catalogue entries of these jobs, as far as they are on record, in the order in which they ended."""
         query = select(JobRow).where(JobRow.id.in_(ids)).order_by(JobRow.finished_at, JobRow.number)
         with self._database.reading() as session:
-            return [told(record_of(row)) for row in session.scalars(query)]
+            return [catalogue_entry(record_of(row)) for row in session.scalars(query)]
 
 
-def told(job: JobRecord) -> dict[str, Any]:
-    """What a catalogue is told of a job, by the names of its columns.
+def catalogue_entry(job: JobRecord) -> dict[str, Any]:
+    """A catalogue's entry of a job, by the names of its columns.
 
     points, triangles : of a scan's mesh. sigma_mm : the median of its points' standard deviations.
     """
@@ -150,9 +150,9 @@ class Notice:
 
 
 class Outbox:
-    """What waits for each receiver, from old to new. Any thread may call.
+    """Notices that wait for each receiver, from old to new. Any thread may call.
 
-    rig : the name that notices bear. wanted : the kinds that each receiver wants, by its name; all others are let go.
+    rig : the name that notices bear. wanted : the kinds that each receiver wants, by its name; all others are dropped.
     most : may wait for one; the oldest make room. `news` is set when one more waits, `dropped` counts those that were
     never sent. clock : for their ages, which a jump of the system's clock must not change. copies : takes every job
     that ends, for a catalogue; None where there is none.
@@ -192,16 +192,16 @@ class Outbox:
             with self.database.changing() as session:
                 session.execute(delete(NoticeRow).where(NoticeRow.receiver == receiver))
 
-    def body(self, kind: NoticeKind | Literal["test"], words: str) -> dict[str, Any]:
-        """What every notice has. words : what it says to people, but for the rig."""
-        told = f"rig '{self._rig}': {words}"
-        return {"id": f"msg_{uuid4().hex}", "kind": kind, "at": stamp(self.clock()), "rig": self._rig, "words": told}
+    def body(self, kind: NoticeKind | Literal["test"], text: str) -> dict[str, Any]:
+        """Members of every notice. text : its message to people, without the rig."""
+        words = f"rig '{self._rig}': {text}"
+        return {"id": f"msg_{uuid4().hex}", "kind": kind, "at": stamp(self.clock()), "rig": self._rig, "words": words}
 
-    def put(self, session: Session, kind: NoticeKind, words: str, /, **members: Mapping[str, Any]) -> None:
-        """Have a notice sent once the session's changes are kept. words : what it says to people, but for the rig."""
-        body = self.body(kind, words)
+    def put(self, session: Session, kind: NoticeKind, text: str, /, **members: Mapping[str, Any]) -> None:
+        """Queue a notice once the session's changes are committed. text : its message to people, without the rig."""
+        body = self.body(kind, text)
         notice_id, at = body["id"], body["at"]
-        # Those of receivers that are no longer in the settings wait for as long, in case these come back.
+        # Notices of receivers that are no longer in the settings wait as long, in case these come back.
         old = NoticeRow.at < stamp(self.clock() - KEPT_FOR)
         session.execute(delete(NoticeRow).where(NoticeRow.receiver.not_in(self._wanted), old))
         for receiver in (name for name, kinds in self._wanted.items() if kind in kinds):
@@ -212,19 +212,19 @@ class Outbox:
             event.listen(session, "after_commit", lambda _, news=self.news[receiver]: news.set(), once=True)
 
     def ended(self, session: Session, job: JobRecord) -> None:
-        """Tell of a job that comes to its end."""
+        """Queue the notice of a job's end."""
         fault = None if job.fault is None else {"code": job.fault.code, "message": job.fault.message}
         more = "" if job.fault is None else f": {job.fault.message}"
         moments = {
             name: None if moment is None else stamp(moment)
             for name, moment in (("started_at", job.started_at), ("finished_at", job.finished_at))
         }
-        told = {**reference(job), "state": str(job.state), "error": fault, "requested_by": job.requested_by, **moments}
+        found = {**reference(job), "state": str(job.state), "error": fault, "requested_by": job.requested_by, **moments}
         state = job.state if job.state in {JobState.SUCCEEDED, JobState.FAILED} else f"was {job.state}"
-        self.put(session, "job.ended", f"{job.kind} {job.id} {state}{more}", job=told)
+        self.put(session, "job.ended", f"{job.kind} {job.id} {state}{more}", job=found)
 
     def closed(self, session: Session, job: JobRecord) -> None:
-        """Have a catalogue know of a job in its final state, and of each change of that."""
+        """Queue the copy of a job in its final state, and of each change of that."""
         if self.copies is not None:
             self.copies.put(session, job)
 
@@ -273,10 +273,10 @@ _LISTED: dict[str, str] = {
 
 
 KEPT_PROGRESS = 20
-"""Jobs that are over and whose events of progress are still on record, for those who follow and are behind."""
+"""Number of finished jobs with events of progress still on record, for followers that are behind."""
 
 EVERY_JOB = UUID(int=0)
-"""Stands for all jobs of a store where they are followed."""
+"""Represents all jobs of a store where they are followed."""
 
 
 class JobStore:
@@ -366,7 +366,7 @@ class JobStore:
         rig: str | None = None,
         preset: str | None = None,
     ) -> Sequence[JobRecord]:
-        """Return up to `limit` jobs, newest first, whose number is below `before`, of those that are asked for.
+        """Return up to `limit` jobs, newest first, with numbers below `before`, that match.
 
         name : part of the label, upper or lower case, or the start of the id. since, until : when they were created,
         the latter excluded. rig, preset : by their names.
@@ -386,7 +386,7 @@ class JobStore:
         if rig is not None:
             query = query.where(JobRow.rig == rig)
         if preset is not None:
-            # A plan that is damaged is no JSON.
+            # A damaged plan may not be JSON.
             found = case((func.json_valid(JobRow.plan), func.json_extract(JobRow.plan, "$.preset.name")))
             query = query.where(found == preset)
         with self.database.reading() as session:
@@ -423,14 +423,14 @@ class JobStore:
         return found
 
     def replan(self, job_id: UUID, plan: Mapping[str, Any]) -> JobRecord:
-        """Record that a job is asked for something else, now that more is known. Raises JobNotFoundError."""
+        """Record a changed plan of a job, now that more is known. Raises JobNotFoundError."""
         with self.database.changing() as session:
             row = self._find(session, job_id)
             row.plan = dict(plan)
             return record_of(row)
 
     def attempts(self, job_id: UUID) -> int:
-        """How often the worker began a job. Raises JobNotFoundError."""
+        """Number of times that the worker began a job. Raises JobNotFoundError."""
         with self.database.reading() as session:
             return self._find(session, job_id).attempts
 
@@ -440,12 +440,12 @@ class JobStore:
             self._find(session, job_id).attempts += 1
 
     def takes(self, job_id: UUID) -> int:
-        """How often a job was lined up to be computed, whether the worker came to it or not."""
+        """Number of times that a job was lined up to be computed, whether the worker began it or not."""
         states = [event.data.get("state") for event in self.events(job_id, after=0) if event.kind == "state"]
         return states.count(JobState.COMPUTING)
 
     def pin(self, job_id: UUID, *kinds: JobKind, pinned: bool) -> JobRecord:
-        """Have a job kept by every retention, or not any more. Raises JobNotFoundError."""
+        """Exempt a job from every retention, or not any more. Raises JobNotFoundError."""
         with self.database.changing() as session:
             row = self._find(session, job_id, *kinds)
             row.pinned = pinned
@@ -487,7 +487,7 @@ class JobStore:
             return [record_of(row) for row in rows]
 
     def damaged(self) -> Mapping[JobKind, int]:
-        """How many jobs of each kind are damaged: their record or their files."""
+        """Number of jobs of each kind with a damaged record or damaged files."""
         query = select(JobRow.kind, func.count()).where(JobRow.failure_code == DamagedError.code).group_by(JobRow.kind)
         with self.database.reading() as session:
             return {JobKind(kind): count for kind, count in session.execute(query) if kind in set(JobKind)}
@@ -508,18 +508,18 @@ class JobStore:
         return datetime.fromisoformat(now)
 
     def progress(self, job_id: UUID, progress: JobProgress) -> None:
-        """Record how far a running job is. Where that cannot be had at once it is refused: the next will be told."""
-        self._tell(job_id, "progress", progress.as_json(), progress)
+        """Record a running job's progress. Refused where that cannot be had at once: the next will be recorded."""
+        self._record(job_id, "progress", progress.as_json(), progress)
 
     def file_made(self, job_id: UUID, name: str) -> None:
         """Record that a file of a running job can be fetched. Refused as `progress` is."""
-        self._tell(job_id, "file", {"name": name})
+        self._record(job_id, "file", {"name": name})
 
     def captured(self, job_id: UUID) -> None:
         """Record that a running job needs the rig no longer. Refused as `progress` is."""
-        self._tell(job_id, "captured", {"time": self._now()})
+        self._record(job_id, "captured", {"time": self._now()})
 
-    def _tell(self, job_id: UUID, kind: str, data: dict[str, Any], at: JobProgress | None = None) -> None:
+    def _record(self, job_id: UUID, kind: str, data: dict[str, Any], at: JobProgress | None = None) -> None:
         with self.database.changing(passing=True) as session:
             row = self._find(session, job_id)
             if at is not None:
@@ -535,7 +535,7 @@ class JobStore:
         fault: JobFailure | None = None,
         summary: Mapping[str, Any] | None = None,
     ) -> bool:
-        """Record a final state. The first one stands: returns False, and changes nothing, for a finished job."""
+        """Record a final state. Only the first one counts: returns False, and changes nothing, for a finished job."""
         with self.database.changing() as session:
             row = self._find(session, job_id)
             if JobState(row.state).final:
@@ -543,7 +543,7 @@ class JobStore:
             self._close_row(session, row, state, fault, summary)
             ended = record_of(row)
             self.outbox.ended(session, ended)
-            # Whoever comes later wants to know how a job ended, not how far it was at each moment.
+            # Later readers want to know how a job ended, not its progress at each moment.
             over = select(JobRow.id).where(JobRow.state.in_([each for each in JobState if each.final]))
             older = over.order_by(JobRow.number.desc()).offset(KEPT_PROGRESS).limit(KEPT_PROGRESS)
             session.execute(delete(EventRow).where(EventRow.kind == "progress", EventRow.job_id.in_(older)))
@@ -561,7 +561,7 @@ class JobStore:
         with self.database.changing() as session:
             row = self._find(session, job_id)
             session.delete(row)
-        # Whoever waits for its next event would wait for ever.
+        # Those who wait for its next event would wait for ever.
         self._wake(job_id, row.parent)
 
     def delete_of(self, parent: UUID) -> None:
@@ -579,7 +579,7 @@ class JobStore:
                     session.delete(row)
 
     def events(self, job_id: UUID, *, after: int) -> Sequence[JobEvent]:
-        """Return a job's events whose number is above `after`, in order."""
+        """Return a job's events with numbers above `after`, in order."""
         query = (
             select(EventRow).where(EventRow.job_id == str(job_id), EventRow.number > after).order_by(EventRow.number)
         )
@@ -587,7 +587,7 @@ class JobStore:
             return [JobEvent(row.number, row.kind, row.data, job_id) for row in session.scalars(query)]
 
     def events_of(self, parent: UUID, *, after: int) -> Sequence[JobEvent]:
-        """Return the events of all jobs of a parent whose number is above `after`, in order."""
+        """Return the events of all jobs of a parent with numbers above `after`, in order."""
         query = (
             select(EventRow)
             .join(JobRow, JobRow.id == EventRow.job_id)
@@ -605,7 +605,7 @@ class JobStore:
         return found or 0
 
     def events_of_all(self, *, after: int, limit: int) -> Sequence[JobEvent]:
-        """Return the first events of all jobs whose number is above `after`, at most `limit`, in order; their data name
+        """Return the first events of all jobs with numbers above `after`, at most `limit`, in order; their data name
         the job: see `reference`. Numbers rise over all jobs, with gaps: those of a job go with it.
         """
         query = select(EventRow, JobRow).join(JobRow, JobRow.id == EventRow.job_id).where(EventRow.id > after)
@@ -631,8 +631,8 @@ class JobStore:
             return self._find(session, job_id).last_event
 
     def watch(self, job_id: UUID, wake: Callable[[], None]) -> Callable[[], None]:
-        """Have `wake` called, from any thread, after each new event of a job, of any job of a parent, or of all jobs,
-        and after a deletion. Returns the call that ends it.
+        """Call `wake`, from any thread, after each new event of a job, of any job of a parent, or of all jobs, and
+        after a deletion. Returns the call that ends it.
         """
         with self._watching:
             self._watchers[job_id].append(wake)
@@ -675,7 +675,7 @@ class JobStore:
         return stamp(self._clock())
 
     def wake(self, *followed: UUID | None) -> None:
-        """Have those look again who `watch` one of these."""
+        """Call the watchers of these."""
         with self._watching:
             watchers = [wake for each in followed if each is not None for wake in self._watchers.get(each, ())]
         for wake in watchers:
@@ -692,7 +692,7 @@ def _jobs(*kinds: JobKind) -> Select[JobRow]:
 def _new_row(
     job_id: UUID, kind: JobKind, plan: Mapping[str, Any], *, rig: str, label: str | None, parent: UUID | None
 ) -> JobRow:
-    """A job that nothing has happened to; where it stands is for the caller to say."""
+    """A job without events; the caller sets its state."""
     return JobRow(
         id=str(job_id),
         kind=kind,
@@ -713,7 +713,7 @@ def _append(session: Session, row: JobRow, kind: str, data: dict[str, Any]) -> N
 
 
 KEY_LIFE_S = 24 * 3600.0
-"""How long a key is remembered unless told otherwise."""
+"""Default time for which a key is remembered."""
 
 
 class RequestKeys:
@@ -748,7 +748,7 @@ class RequestKeys:
                 )
                 raise IdempotencyError(message)
             if held.job_id is None:
-                message = "The first request with this Idempotency-Key is still being answered. Ask again in a second."
+                message = "The first request with this Idempotency-Key is still being answered. Try again in a second."
                 raise KeyInFlightError(message)
             return UUID(held.job_id)
 
@@ -759,12 +759,12 @@ class RequestKeys:
                 held.job_id = str(made)
 
     def release(self, key: str) -> None:
-        """Free a key whose request made nothing, so that it may be tried again."""
+        """Free a key after a request that made nothing, so that it may be tried again."""
         with self._database.changing() as session:
             session.execute(delete(KeyRow).where(KeyRow.key == key, KeyRow.job_id.is_(None)))
 
     def release_all(self) -> None:
-        """Free every key whose request was cut off. For the start of the service, when none can be in flight."""
+        """Free every key with a cut-off request. For the start of the service, when none can be in flight."""
         with self._database.changing() as session:
             session.execute(delete(KeyRow).where(KeyRow.job_id.is_(None)))
 
@@ -815,7 +815,7 @@ class Audit:
                 session.execute(delete(AuditRow).where(AuditRow.number <= newest - MOST_ENTRIES))
 
     def page(self, *, before: int | None, limit: int) -> Sequence[AuditEntry]:
-        """Up to `limit` entries, newest first, whose number is below `before`."""
+        """Up to `limit` entries, newest first, with numbers below `before`."""
         query = select(AuditRow).order_by(AuditRow.number.desc()).execution_options(yield_per=limit)
         if before is not None:
             query = query.where(AuditRow.number < before)

@@ -1,7 +1,7 @@
 """The mathematics in a process of its own: it shares no interpreter lock with capture and HTTP, and may end alone.
 
 One process and one pipe rather than a process pool: a pool can report no progress, cannot stop a running task, and
-joins it at exit. Here a lost process is seen at once, and the next job starts a fresh one.
+joins it at exit. Here a lost process is noticed at once, and the next job starts a fresh one.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from slrig.logs import LogSettings, set_up_logs
 from slrig.model import Region
 
 HEARTBEAT_S = 0.5
-"""How often the process says that it runs: often enough that a person who asks `/readyz` sees a stop within seconds."""
+"""Interval of the process's heartbeat: short enough that `/readyz` shows a stop within seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class JobFiles:
-    """Where the files of a job are made, and where they belong; what its frames proved as they were captured."""
+    """Folders in which the files of a job are made and where they belong; the evidence of its captured frames."""
 
     id: UUID
     folder: Path
@@ -55,9 +55,9 @@ class JobFiles:
 class Task:
     """A task of the worker: a call of a function, which is found there by its name and loads its mathematics itself.
 
-    files : of a job, whose `Job.compute` the function is: it is given a `JobRun`. what : the task in words. remedy :
-    what a person can do when the worker is lost in the middle of it. where : how it came to be done where it is, for a
-    report.
+    files : of a job, if the function is its `Job.compute`: it is given a `JobRun`. what : the task's name for people.
+    remedy : what a person can do when the worker is lost in the middle of it. where : the reason for the place of the
+    computation, for a report.
     """
 
     function: Callable[..., Any]
@@ -148,7 +148,7 @@ class Failed:
 
 
 def sent(pipe: Connection, message: object) -> bool:
-    """Send a message; return whether somebody is there to receive it."""
+    """Send a message; return whether the receiver is there."""
     try:
         pipe.send(message)
     except OSError:
@@ -170,8 +170,8 @@ def serve(
 ) -> None:
     """The child's life: prepare, then do jobs until the parent's end of the pipe is gone.
 
-    stops : brings the numbers of jobs that are not wanted any more, past whatever waits in the pipe. heartbeat : takes
-    the time of the last sign of life, `time.monotonic`. module : offers `warm_kernels(told)`, and `LiveScan`
+    stops : brings the numbers of jobs that are no longer wanted, past other messages in the pipe. heartbeat : takes
+    the time of the last sign of life, `time.monotonic`. module : offers `warm_kernels(report)`, and `LiveScan`
     for the frames of a capture; jobs find it as `JobRun.pipeline`. logs : how the parent logs.
     """
     if logs is not None:
@@ -186,7 +186,7 @@ def serve(
         loaded = importlib.import_module(module)
         fed = FedCaptures(loaded.LiveScan)
         loaded.warm_kernels(lambda prepared: sent(pipe, Preparing(prepared.done, prepared.total)))
-    except Exception as error:  # noqa: BLE001 - whatever it is, the parent and the log are told
+    except Exception as error:  # noqa: BLE001 - any error is reported to the parent and logged
         sent(pipe, Unloadable(f"{type(error).__name__}: {error}"))
         _log.exception("the worker cannot load what it computes with", module=module)
         raise SystemExit(1) from None
@@ -207,7 +207,7 @@ def serve(
 
 
 def _beat(heartbeat: c_double) -> None:
-    """Tell that this process lives, until the service does not: a kernel that compiles would go on for minutes."""
+    """Show that this process runs; end it with the service: a kernel that compiles would go on for minutes."""
     parent = multiprocessing.parent_process()
     # The service may have ended while this process was loading: its parent is another one then.
     waiting, service = threading.Event(), os.getppid() if parent is None else parent.pid
@@ -218,22 +218,22 @@ def _beat(heartbeat: c_double) -> None:
 
 
 def _be_ended_first() -> None:
-    """Have the kernel end this process rather than the service, which holds the rig, where memory runs out."""
+    """Make the kernel end this process rather than the service, which holds the rig, where memory runs out."""
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("500")
 
 
 def _answer(pipe: Connection, stops: Connection, run: RunTask, pipeline: Any, live: Any) -> Done | Failed:
     stopped = False
-    # A task may tell of its progress from several threads.
-    telling = threading.Lock()
+    # A task may report progress from several threads.
+    sending = threading.Lock()
 
     def progress(stage: str, fraction: float, detail: str) -> None:
-        with telling:
+        with sending:
             pipe.send(Progressed(run.number, stage, fraction, detail))
 
     def made(name: str) -> None:
-        with telling:
+        with sending:
             pipe.send(FileMade(run.number, name))
 
     def cancelled() -> bool:
@@ -252,21 +252,21 @@ def _answer(pipe: Connection, stops: Connection, run: RunTask, pipeline: Any, li
         )  # fmt: skip
         return Done(run.number, task.function(job_run))
     except (ConnectionError, EOFError):
-        # The parent is gone: nobody waits for an answer.
+        # The parent is gone: no one waits for an answer.
         raise
     except BaseException as error:  # noqa: BLE001 - the traceback travels to the parent, which logs it
         return Failed(run.number, job_failure(error), traceback.format_exc())
 
 
 CANCEL_LIMIT_S = 10.0
-"""A job that has not stopped this long after it was asked to is stopped by ending its process."""
+"""A job that has not stopped this long after the request is stopped by ending its process."""
 
 SILENCE_LIMIT_S = 30.0
-"""A process that shows no sign of life this long during a job is taken for dead. It shows two a second, and no single
+"""A process that shows no sign of life this long during a job counts as hung. It shows two a second, and no single
 step of the mathematics holds the interpreter for more than a second or two; a machine that swaps may."""
 
 STANDSTILL_LIMIT_S = 900.0
-"""A job that tells no progress this long is taken for one that never ends: the longest step that was measured, a solve
+"""A job that reports no progress this long counts as one that never ends: the longest step that was measured, a solve
 of sixty poses, takes about a minute."""
 
 POLL_S = 0.1
@@ -274,8 +274,8 @@ POLL_S = 0.1
 
 @dataclass(slots=True)
 class JobWait:
-    """The wait for one job: what the process says is heard, and what ends the wait is found. noted : takes what the
-    process says of itself.
+    """Waits for one job of the process and finds how the wait ends. noted : takes the process's
+    messages about itself.
     """
 
     task: Task
@@ -289,7 +289,7 @@ class JobWait:
     answered: bool = False
     _answer: Done | Failed | None = None
     _stop_after: float | None = None
-    _looked_s: float = field(default_factory=time.monotonic)
+    _checked_s: float = field(default_factory=time.monotonic)
     _beat: float = -1.0
     _silence_s: float = 0.0
     _standstill_s: float = 0.0
@@ -297,7 +297,7 @@ class JobWait:
     def settled(self, feed: FrameFeed) -> bool:
         """Wait until the frames of a capture have been sent, or cannot be; return whether all were."""
         while not feed.settled(POLL_S):
-            # A process that still prepares its kernels takes no frames, and tells how far it is.
+            # A process that still prepares its kernels takes no frames, and reports how far it is.
             self._hear()
             if self._watch():
                 feed.abandon()
@@ -326,23 +326,23 @@ class JobWait:
                 case Done(number) | Failed(number) as answer if number == self.number:
                     self.answered, self._answer = True, answer
                 case Progressed() | FileMade() | Done() | Failed():
-                    _log.warning("an answer that nobody waits for was dropped")
-                case None | Unloadable() as told:
-                    self.noted(told)
+                    _log.warning("an unexpected answer was dropped")
+                case None | Unloadable() as message:
+                    self.noted(message)
                     raise self.lost()
-                case told:
+                case message:
                     self._standstill_s = 0.0
-                    self.noted(told)
-                    if isinstance(told, Preparing):
-                        self.listener.report(PREPARING, 0.0, str(told))
+                    self.noted(message)
+                    if isinstance(message, Preparing):
+                        self.listener.report(PREPARING, 0.0, str(message))
 
     def _watch(self) -> bool:
-        """Have the process stop when the job is cancelled, and end it when it does not, or is dead or stuck. Returns
-        whether the job is cancelled.
+        """Request the process to stop when the job is cancelled, and end it when it does not, or hangs. Returns whether
+        the job is cancelled.
         """
         now_s = time.monotonic()
-        # By looks rather than by the clock: where the service itself was stopped, nothing is known of the worker.
-        step_s, self._looked_s = min(now_s - self._looked_s, 1.0), now_s
+        # Counted by checks rather than by the clock: a stopped service knows nothing of the worker.
+        step_s, self._checked_s = min(now_s - self._checked_s, 1.0), now_s
         if self.heartbeat.value != self._beat:
             self._beat, self._silence_s = self.heartbeat.value, 0.0
         else:
@@ -351,9 +351,9 @@ class JobWait:
         if self._silence_s > SILENCE_LIMIT_S:
             raise self._replaced(f"showed no sign of life for {self._silence_s:.0f} s")
         if self._standstill_s > STANDSTILL_LIMIT_S:
-            raise self._replaced(f"told no progress for {self._standstill_s / 60:.0f} minutes")
+            raise self._replaced(f"reported no progress for {self._standstill_s / 60:.0f} minutes")
         if self._stop_after is not None and now_s > self._stop_after:
-            _log.warning("a job did not stop when asked, its process is ended", job=self.task.what)
+            _log.warning("a job did not stop when requested, its process is ended", job=self.task.what)
             message = f"The {self.task.what} was cancelled."
             raise ScanCancelledError(message)
         if self._stop_after is None and self.listener.cancelled():
@@ -364,13 +364,13 @@ class JobWait:
     def _replaced(self, why: str) -> WorkerLostError:
         _log.error("the worker is replaced", job=self.task.what, why=why)
         message = (
-            f"The worker {why} in the middle of the {self.task.what}, and has been replaced. Look for what stops or "
+            f"The worker {why} in the middle of the {self.task.what}, and has been replaced. Find out what stops or "
             f"overloads this machine. {self.task.remedy}"
         )
         return WorkerLostError(message)
 
     def lost(self) -> WorkerLostError:
-        """The error that stands for a process that ended."""
+        """The error of a process that ended."""
         self.process.join()
         code = self.process.exitcode
         how = f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit code {code}"
@@ -383,8 +383,8 @@ class JobWait:
 
 _ENDED = "its process ended (if the machine ran out of memory, free some)"
 
-SILENCE_TOLD_S = 5.0
-"""From when on `condition` tells that the process shows no sign of life."""
+SILENCE_SHOWN_S = 5.0
+"""Silence after which `condition` says that the process shows no sign of life."""
 
 LOADING = "loading the numerical code (a minute or more where it has to be compiled)"
 READY = "ok"
@@ -428,7 +428,7 @@ class Worker:
             while self._loading and not self._running and self._pipe is not None and self._pipe.poll():
                 self._note(received(self._pipe))
             silence_s = self._silence_s()
-            if self._condition == READY and silence_s > SILENCE_TOLD_S:
+            if self._condition == READY and silence_s > SILENCE_SHOWN_S:
                 return (
                     f"the worker shows no sign of life for {silence_s:.0f} s; a job that waits for it has it replaced"
                 )
@@ -441,21 +441,21 @@ class Worker:
 
     @property
     def loading(self) -> bool:
-        """Whether the process is not ready yet, and there is hope, as `condition` found it last."""
+        """Whether the process is not ready yet, but may become so, as `condition` found it last."""
         return self._loading
 
-    def _note(self, told: object | None) -> None:
-        """Take what a process says before its first answer; None stands for its death."""
-        if isinstance(told, Preparing):
-            self._condition = f"{PREPARING}, {told}"
-        elif isinstance(told, Ready):
+    def _note(self, message: object | None) -> None:
+        """Take a message of a process before its first answer; None represents its end."""
+        if isinstance(message, Preparing):
+            self._condition = f"{PREPARING}, {message}"
+        elif isinstance(message, Ready):
             self._condition, self._loading = READY, False
         elif self._loading:
-            # Of a process that is gone, and nothing more is to be read from its pipe, whoever ended it.
+            # The process is gone, and nothing more is to be read from its pipe.
             self._loading = False
             if self._closed:
                 return
-            cause = told.cause if isinstance(told, Unloadable) else _ENDED
+            cause = message.cause if isinstance(message, Unloadable) else _ENDED
             self._condition = f"the reconstruction cannot be loaded: {cause}; the service's log has the details"
             _log.error("the reconstruction cannot be loaded", cause=cause)
 
@@ -497,7 +497,7 @@ class Worker:
 
     def feed(self, region: Region | None = None) -> FrameFeed:
         """A way for the frames of a capture to reach the process while they are taken; give it to `run` afterwards.
-        region : what of the scene is asked for.
+        region : the requested part of the scene.
 
         While those of an earlier capture still wait to be sent, it is abandoned from the start: the process is busy,
         and frames of one capture are enough to be kept in memory.
@@ -528,12 +528,12 @@ class Worker:
         """Do a task when it is its turn, and return its result. Frames that `feed` has sent, all of them, are used.
         within_s : the longest wait for its beginning, None for any.
 
-        Whatever but an answer ends the wait, the process is replaced: what it still computes belongs to nobody.
+        Where anything but an answer ends the wait, the process is replaced: its results would have no owner.
 
         Raises
         ------
         SlrigError
-            Whatever the task raised, by class and message.
+            The error of the task, by class and message.
         ScanCancelledError
             The listener had it cancelled.
         ScanInterruptedError
@@ -541,7 +541,7 @@ class Worker:
         WorkerBusyError
             It did not begin within `within_s`: others were before it, or the process was not ready.
         WorkerLostError
-            The process ended, showed no sign of life, or told no progress for too long.
+            The process ended, showed no sign of life, or reported no progress for too long.
         UnexpectedWorkerError
             The task has a defect.
         """
@@ -556,7 +556,7 @@ class Worker:
             if process is None or pipe is None or stops is None:
                 raise interruption_error()
             number, fed = next(self._numbers), False
-            # A process that was started since the capture has not seen its frames.
+            # A process that was started since the capture has not received its frames.
             if feed is not None and feed.receiver is pipe:
                 number, fed = feed.number, True
             job = JobWait(task, number, process, pipe, stops, self._heartbeat, listener, self._noted)
@@ -587,14 +587,14 @@ class Worker:
                 raise _error(answer)
             return answer.result
 
-    def _noted(self, told: object | None) -> None:
+    def _noted(self, message: object | None) -> None:
         with self._guard:
-            self._note(told)
+            self._note(message)
 
     @contextmanager
     def _its_turn(self, task: Task, listener: Listener, until_s: float | None) -> Iterator[None]:
         """Wait until the jobs that came before are over."""
-        turn, told = next(self._numbers), False
+        turn, reported = next(self._numbers), False
         with self._turn:
             self._turns.append(turn)
         try:
@@ -602,12 +602,12 @@ class Worker:
                 with self._turn:
                     if self._turn.wait_for(lambda: self._turns[0] == turn, timeout=POLL_S):
                         break
-                if not told:
+                if not reported:
                     listener.report(WAITING, 0.0, "another job is computed first")
-                    told = True
+                    reported = True
                 listener.check(f"The {task.what} was cancelled.")
                 if until_s is not None and time.monotonic() > until_s:
-                    message = f"Another job is computed, and the {task.what} has to wait for it. Ask again."
+                    message = f"Another job is computed, and the {task.what} has to wait for it. Try again."
                     raise WorkerBusyError(message)
             yield
         finally:
@@ -619,12 +619,12 @@ class Worker:
         """Wait, in its turn, until the process has loaded its kernels, or cannot."""
         while self.condition != READY and self._loading:
             if time.monotonic() > until_s:
-                message = f"The worker is not ready yet for the {task.what} ({self._condition}). Ask again."
+                message = f"The worker is not ready yet for the {task.what} ({self._condition}). Try again."
                 raise WorkerBusyError(message)
             time.sleep(POLL_S)
 
     def close(self) -> None:
-        """End the process, whatever it does. Idempotent."""
+        """Kill the process. Idempotent."""
         with self._guard:
             self._closed = True
             process = self._process
@@ -645,7 +645,7 @@ def job_task(job: Job, run: JobRun) -> Task:
 
 
 REQUEST_WAIT_S = 30.0
-"""How long a request waits for the worker to begin; then its client, who waits a minute, is told to come again."""
+"""Longest wait of a request for the worker to begin; then its client, who waits a minute, is refused for now."""
 
 
 class Compute(Protocol):
@@ -658,7 +658,7 @@ class Compute(Protocol):
 
     @property
     def loading(self) -> bool:
-        """Whether it is not ready yet, and there is hope."""
+        """Whether it is not ready yet, but may become so."""
         ...
 
     def start(self) -> None:

@@ -438,7 +438,7 @@ class CalibrationTask:
         facts = self._manager.rig.facts
         require_positions(facts, asked.positions)
         first, *others = asked.positions or range(0 if facts is None else len(facts.positions))
-        session = self._calibrations.open(asked.board.board(), label=holder.words).id
+        session = self._calibrations.open(asked.board.board(), label=holder.label).id
         try:
             try:
                 # The first may not wait: a busy rig is told before anything was done.

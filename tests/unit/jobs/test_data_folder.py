@@ -715,9 +715,9 @@ def test_nothing_that_is_there_is_overwritten(tmp_path: Path, store: JobStore, f
 
 
 def test_what_is_no_data_folder_and_what_is_no_backup_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(StorageError, match="no data folder of slrig"):
+    with pytest.raises(StorageError, match="not a data folder of slrig"):
         back_up(tmp_path, tmp_path / "backup")
-    with pytest.raises(StorageError, match="no whole backup"):
+    with pytest.raises(StorageError, match="not a complete backup"):
         restore(tmp_path, tmp_path / "elsewhere")
 
 

@@ -214,7 +214,7 @@ def test_it_looks_at_its_start_and_when_it_is_told_to(archive: Scans) -> None:
     assert archive.removed.wait(30)
     archive.removed.clear()
     made.append(archive.scan())
-    retention.look("scan")
+    retention.check("scan")
     assert archive.removed.wait(30)
     retention.close()
     assert [each.id for each in archive.store.finished()] == made[2:]

@@ -206,7 +206,7 @@ def test_an_answer_of_another_job_is_dropped() -> None:
 
 @pytest.mark.slow
 def test_a_process_that_shows_no_sign_of_life_is_replaced(worker: Worker, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker_module, "SILENCE_TOLD_S", 0.0)
+    monkeypatch.setattr(worker_module, "SILENCE_SHOWN_S", 0.0)
     monkeypatch.setattr(worker_wait, "SILENCE_LIMIT_S", 1.5)
     stopped = worker.run(task("process_id"))
     os.kill(stopped, signal.SIGSTOP)
@@ -222,7 +222,7 @@ def test_a_job_without_progress_is_taken_for_one_that_never_ends(
     worker: Worker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(worker_wait, "STANDSTILL_LIMIT_S", 0.2)
-    with pytest.raises(WorkerLostError, match=r"told no progress for .* in the middle of the examination"):
+    with pytest.raises(WorkerLostError, match=r"reported no progress for .* in the middle of the examination"):
         worker.run(task("wait_for", tmp_path / "never"))
 
 
@@ -375,7 +375,7 @@ def test_a_task_that_cannot_begin_in_time_is_refused_and_the_worker_goes_on(work
     )
     waiting.start()
     assert began.wait(WAIT_S)
-    with pytest.raises(WorkerBusyError, match=r"Another job is computed, and the examination has to wait.*Ask again"):
+    with pytest.raises(WorkerBusyError, match=r"Another job is computed, and the examination has to wait.*Try again"):
         worker.run(task("process_id"), within_s=0.0)
     gate.touch()
     waiting.join(WAIT_S)
