@@ -280,7 +280,7 @@ class AcceptanceTests:
         with self._lock:
             rig = self._manager.rig
             if rig.facts is None:
-                message = "The rig is being opened. Ask again in a moment."
+                message = "The rig is being opened. Try again in a moment."
                 raise DeviceBusyError(message)
             calibration = rig.facts.calibration if rig.active is None else rig.active.calibration
             if calibration is None:

@@ -162,7 +162,7 @@ def _camera(name: str, camera: CameraInfo, settings: SettingsInUse | None) -> Ca
         triggers=sorted(camera.triggers),
         exposure_s=None if applied is None else applied.exposure_s,
         gain=None if applied is None else applied.gain,
-        notes=[*camera.notes, *(() if settings is None else settings.words)],
+        notes=[*camera.notes, *(() if settings is None else settings.notes)],
     )
 
 

@@ -542,7 +542,7 @@ class JobManager:
                 # Not at once again, where that is what fails.
                 time.sleep(_POLL_S)
         self.rig.darken()
-        self.rig.let_go()
+        self.rig.release()
 
     def _next(self) -> _Work | None:
         while True:
@@ -645,7 +645,7 @@ class JobManager:
                 self._previews.run(rig, stop=lambda: self._wanted() or self.live.wanted)
         except BaseException as raised:  # noqa: BLE001 - the owner thread goes on after any failure of a preview
             error = as_error(raised)
-            self.rig.let_go(error)
+            self.rig.release(error)
             self._log_unopened(error)
             fault = job_failure(error)
             self._send_away(error if isinstance(error, SlrigError) else DeviceError(fault.message))

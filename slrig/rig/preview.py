@@ -1,7 +1,7 @@
-"""Live pictures of a camera while nobody scans, to aim, to focus and to see what is lit.
+"""Live pictures of a camera between scans, to aim, to focus and to see what is lit.
 
 They are taken on the thread that owns the rig, between scans: a scan that wants the rig gets it after the picture that
-is being taken. The projector is dark unless somebody asked for light, and dark again when nobody looks any more.
+is being taken. The projector is dark unless a viewer requested light, and dark again when the last viewer leaves.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LONGEST_S = 1.0
 
 
 class Light(StrEnum):
-    """What the projector does while somebody looks."""
+    """Light of the projector during a preview."""
 
     OFF = "off"
     WHITE = "white"
@@ -48,7 +48,7 @@ class Picture:
     _making: threading.Lock = field(default_factory=threading.Lock)
 
     def made(self, kind: Hashable, make: Callable[[NDArray[np.uint8]], bytes]) -> bytes:
-        """What is made of the image, of each kind once for all who look, however many they are."""
+        """A product of the image, computed once per kind for all viewers."""
         with self._making:
             if kind not in self._made:
                 self._made[kind] = make(self.image)
@@ -56,7 +56,7 @@ class Picture:
 
 
 class Watch:
-    """Somebody who looks through a camera. Leave the `with` block to look away."""
+    """A viewer of one camera, until the end of the `with` block."""
 
     def __init__(self, room: Previews, camera: str, light: Light, exposure_s: float | None = None) -> None:
         self.camera = camera
@@ -84,9 +84,9 @@ class Watch:
 
 
 class Previews:
-    """Who looks, and the latest picture of each camera. All but `run` may be called from any thread.
+    """Viewers, and the latest picture of each camera. All but `run` may be called from any thread.
 
-    woken : called when somebody begins to look.
+    woken : called when a viewer comes.
     """
 
     def __init__(self, woken: Callable[[], None]) -> None:
@@ -98,25 +98,25 @@ class Previews:
 
     @property
     def wanted(self) -> bool:
-        """Whether somebody looks."""
+        """Whether there are viewers."""
         with self._changed:
             return bool(self._watches)
 
     def watch(self, camera: str, light: Light, exposure_s: float | None = None) -> Watch:
-        """Begin to look through a camera. exposure_s : as near as the camera can; None the rig file's. It is the
-        camera's one for all who look: that of whoever asked last.
+        """Add a viewer of a camera. exposure_s : as near as the camera can; None the rig file's. All viewers of the
+        camera get the exposure requested last.
         """
         watch = Watch(self, camera, light, exposure_s)
         with self._changed:
             if not self._watches:
-                # What somebody saw earlier is not what is there now.
+                # Earlier pictures no longer show the scene.
                 self._pictures.clear()
             self._watches.append(watch)
         self._woken()
         return watch
 
     def leave(self, watch: Watch) -> None:
-        """Look away. Idempotent."""
+        """Remove a viewer. Idempotent."""
         with self._changed:
             self._watches = [each for each in self._watches if each is not watch]
             self._faults.pop(watch, None)
@@ -136,32 +136,32 @@ class Previews:
             return self._pictures[watch.camera] if came else None
 
     def fail(self, error: SlrigError) -> None:
-        """Send everybody away, and tell them why."""
+        """End all viewers with an error."""
         with self._changed:
             self._faults.update(dict.fromkeys(self._watches, error))
             self._watches = []
             self._changed.notify_all()
 
     def run(self, rig: Rig, stop: Callable[[], bool]) -> None:
-        """Take pictures until nobody looks, or `stop` says so. For the thread that owns the rig.
+        """Take pictures until no viewer is left, or `stop` says so. For the thread that owns the rig.
 
-        Raises whatever the devices raise. The projector is dark and the cameras are disarmed afterwards.
+        Raises the devices' errors. The projector is dark and the cameras are disarmed afterwards.
         """
         shown: dict[str, _CameraPreview] = {}
         light: Light | None = None
         try:
             while not stop():
                 began_s = time.monotonic()
-                asked = self._asked()
-                if not asked:
+                requested = self._requested()
+                if not requested:
                     break
-                wanted = Light.WHITE if any(each is Light.WHITE for each, _ in asked.values()) else Light.OFF
+                wanted = Light.WHITE if any(each is Light.WHITE for each, _ in requested.values()) else Light.OFF
                 if wanted is not light:
                     light = wanted
                     _set_light(rig, light)
-                for name in [name for name in shown if name not in asked]:
+                for name in [name for name in shown if name not in requested]:
                     shown.pop(name).close()
-                for name, (_, exposure_s) in asked.items():
+                for name, (_, exposure_s) in requested.items():
                     if name not in shown:
                         shown[name] = _CameraPreview(rig, name)
                     shown[name].expose(exposure_s)
@@ -174,17 +174,17 @@ class Previews:
                     each.close()
             rig.projector.blank()
 
-    def _asked(self) -> Mapping[str, tuple[Light, float | None]]:
-        """The cameras that somebody looks through, each with the light and the exposure that were asked for."""
+    def _requested(self) -> Mapping[str, tuple[Light, float | None]]:
+        """The cameras with viewers, each with the requested light and exposure."""
         with self._changed:
-            asked: dict[str, tuple[Light, float | None]] = {}
+            requested: dict[str, tuple[Light, float | None]] = {}
             for watch in self._watches:
-                light, exposure_s = asked.get(watch.camera, (watch.light, None))
-                asked[watch.camera] = (
+                light, exposure_s = requested.get(watch.camera, (watch.light, None))
+                requested[watch.camera] = (
                     Light.WHITE if watch.light is Light.WHITE else light,
                     watch.exposure_s or exposure_s,
                 )
-            return asked
+            return requested
 
     def _put(self, camera: str, image: NDArray[np.uint8]) -> None:
         with self._changed:
@@ -193,12 +193,12 @@ class Previews:
             self._changed.notify_all()
 
     def _rest(self, until_s: float, stop: Callable[[], bool]) -> None:
-        """Keep to the pace, but not when somebody wants the rig or everybody has left."""
+        """Keep the pace, unless the rig is wanted or the last viewer has left."""
         with self._changed:
             self._changed.wait_for(lambda: stop() or not self._watches, max(until_s - time.monotonic(), 0.0))
 
     def interrupt(self) -> None:
-        """Have `run` ask `stop` now."""
+        """Make `run` check `stop` now."""
         with self._changed:
             self._changed.notify_all()
 

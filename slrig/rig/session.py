@@ -32,14 +32,14 @@ from slrig.model import Calibration, RotationAxis, Size
 from slrig.rig.watchdog import OPEN, OPEN_LIMIT_S, Call, Calls, SettingsInUse, guarded
 
 SAME_PLACE_DEG = 0.1
-"""How far a table's own count may be from where it was left: above any step of a motor, below any turn of a hand."""
+"""Largest change of a table's own count while closed: above any step of a motor, below any manual turn."""
 
 FROM_THE_START = "start"
 """The count of a table that each opening brings to the same place."""
 
 
 class _LastPosition(BaseModel):
-    """Where a table was left. at_deg : None while it turned. own_deg : by its own count."""
+    """Last known position of a table. at_deg : None while it turned. own_deg : by its own count."""
 
     count: str
     at_deg: float | None = None
@@ -49,11 +49,11 @@ class _LastPosition(BaseModel):
 class CountedTurntable:
     """Implements `slrig.devices.Turntable` by another one, whose angles count from its opening.
 
-    A table whose own count is as it was left goes on from the angle where it stands. One that turned when the service
-    was killed, or that counts anew, has angles that have nothing to do with those from before: they are of another
-    `count`. A hand that moves a table without a scale of its own is not noticed.
+    A table with an unchanged own count continues from its angle. One that turned when the service was killed, or that
+    has restarted its count, has angles unrelated to those from before: they are of another `count`. A manual turn of a
+    table without a scale of its own is not noticed.
 
-    count : equal for all angles with one zero. path : the file that keeps where it stands; its folder is made.
+    count : equal for all angles with one zero. path : the file that keeps its position; its folder is made.
     """
 
     def __init__(self, table: Turntable, path: Path) -> None:
@@ -70,7 +70,7 @@ class CountedTurntable:
                 self.count, self._offset_deg = left.count, left.at_deg + table.opened_at_deg - left.own_deg
             else:
                 self.count = uuid4().hex
-                _log.info("the turntable's angles count anew from where it stands", count=self.count)
+                _log.info("the turntable's angles have a new zero, its present position", count=self.count)
 
     @property
     def poses(self) -> Sequence[str]:
@@ -108,7 +108,7 @@ class CountedTurntable:
         own_deg = angle_deg - self._offset_deg
         self._keep(_LastPosition(count=self.count))
         self._table.turn(own_deg)
-        # If that is refused, the next opening counts anew.
+        # If that is refused, the next opening starts a new count.
         with suppress(StorageError):
             self._keep(_LastPosition(count=self.count, at_deg=angle_deg, own_deg=opened_deg + own_deg))
 
@@ -116,14 +116,14 @@ class CountedTurntable:
         """See `Positioner`."""
         self._table.close()
 
-    def _keep(self, standing: _LastPosition) -> None:
+    def _keep(self, position: _LastPosition) -> None:
         with storage_errors(self._path):
             self._path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(self._path, standing.model_dump_json().encode())
+        write_file(self._path, position.model_dump_json().encode())
 
 
 def _left(path: Path) -> _LastPosition | None:
-    """Where the table was left, None where nobody knows. What cannot be read is not known either."""
+    """Last position of the table, None where it is unknown or cannot be read."""
     try:
         return _LastPosition.model_validate_json(path.read_bytes())
     except FileNotFoundError:
@@ -140,11 +140,11 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class RigFacts:
-    """What an open rig declares about itself: data that any thread may read.
+    """Facts that an open rig declares about itself: data that any thread may read.
 
-    calibration : of the rig file, or of the head. positions : the poses that what moves the board can take, by name;
-    none where a person does. turntable : whether it turns what stands on it to any angle. axis : where its maker says
-    that it turns, in the frame of `calibration`; None where that is not known. lost : as of `Rig`.
+    calibration : of the rig file, or of the head. positions : names of the poses of the machine that moves the board;
+    none where a person does. turntable : whether it turns objects to any angle. axis : its axis as its maker states it,
+    in the frame of `calibration`; None where that is not known. lost : as of `Rig`.
     """
 
     cameras: Mapping[str, CameraInfo]
@@ -174,9 +174,9 @@ class ActiveCalibration:
 
 @contextmanager
 def driver_errors(rig: str) -> Iterator[None]:
-    """Turn what the operating system tells a driver within the block into a DeviceError.
+    """Convert the operating system's errors of a driver within the block into a DeviceError.
 
-    Whatever writes to a disk there has to tell its refusals as StorageError itself.
+    Code that writes to a disk there has to raise StorageError itself.
     """
     try:
         yield
@@ -193,7 +193,7 @@ class RigSession:
     `active` replaces the rig's own calibration for all that begins afterwards. One that is for other
     devices leaves the rig without any: the rig can still be calibrated, and a scan is refused.
 
-    table_at : the file that keeps where a turntable stands, so that its angles go on from one opening to the next.
+    table_at : the file that keeps a turntable's position, so that its angles go on from one opening to the next.
     """
 
     def __init__(
@@ -207,11 +207,11 @@ class RigSession:
         self._bare: Rig | None = None
         self.facts: RigFacts | None = None
         self.settings: dict[str, SettingsInUse] = {}
-        """Of each camera that was set since the rig was opened, by its name."""
+        """Settings of each camera that was set since the rig was opened, by its name."""
         self.fault: JobFailure | None = None
         self.active: ActiveCalibration | None = None
         self.health: Callable[[], Mapping[str, Any] | None] = lambda: None
-        """How well the calibration in use holds now, for the report of a scan; None before it was verified."""
+        """Health of the calibration in use, for the report of a scan; None before it was verified."""
         self._dropped = False
 
     def open(self) -> Rig:
@@ -254,7 +254,7 @@ class RigSession:
     def find_lost(self) -> None:
         """Close a rig without some of its cameras, so that the next work opens it with those that are back."""
         if self._rig is not None and self._rig.lost:
-            self.let_go()
+            self.release()
 
     @property
     def axis(self) -> RotationAxis | None:
@@ -265,7 +265,7 @@ class RigSession:
 
     @property
     def calibration(self) -> Calibration | None:
-        """What work that is begun now uses: the active one, or else the rig's own; None before the rig was open."""
+        """The calibration of new work: the active one, or else the rig's own; None before the rig was open."""
         active = self.active
         if active is not None:
             return self._fitting(active)
@@ -280,7 +280,7 @@ class RigSession:
             message = f"The rig cannot be opened: {self.fault.message}"
             raise DeviceError(message)
         if facts is None:
-            message = "The rig is being opened. Ask again in a moment."
+            message = "The rig is being opened. Try again in a moment."
             raise DeviceBusyError(message)
         if camera not in facts.cameras:
             message = f"The rig has no camera '{camera}'; it has {', '.join(facts.cameras)}."
@@ -302,14 +302,14 @@ class RigSession:
         return None
 
     def use_calibration(self, active: ActiveCalibration | None) -> None:
-        """Have what is begun from now on use a calibration; None has it use the rig's own. On any thread.
+        """Use a calibration for work begun from now on; None for the rig's own. On any thread.
 
         Raises
         ------
         CalibrationError
             It is for other devices than those of the open rig.
         """
-        # Before the rig is open its devices are unknown; a scan is then refused with the same words.
+        # Before the rig is open its devices are unknown; a scan is then refused with the same message.
         fault = None if active is None or active.calibration is None else self.misfit(active)
         if fault is not None:
             raise fault
@@ -327,25 +327,25 @@ class RigSession:
             raise CalibrationError(message)
 
     def doubt(self, error: Exception) -> None:
-        """Let the rig go if an error leaves the state of its devices unknown; the next work opens them afresh."""
+        """Close the rig if an error leaves the state of its devices unknown; the next work opens them again."""
         failed = isinstance(error, DeviceError) and not isinstance(error, UnsupportedByDeviceError)
         if failed or job_failure(error).code == UNEXPECTED:
-            self.let_go(error)
+            self.release(error)
 
     def _opened(self) -> Rig:
         with driver_errors(self.name):
             return self._open_rig()
 
     def _drop_failed(self) -> None:
-        """Let the rig go if a device failed and nobody was told, as at the end of a scan that had all its frames."""
+        """Close the rig after an unreported failure of a device, as at the end of a scan that had all its frames."""
         if self._rig is not None and self.calls.failure is not None:
-            self.let_go(self.calls.failure)
+            self.release(self.calls.failure)
 
     def open_for_checks(self) -> Rig:
         """Close the rig, and return it opened once more, for checks of its drivers. No watch is kept over its calls,
         and the caller closes it. May be called again afterwards. `recover` opens the rig as usual. Raises as `open`.
         """
-        self.let_go()
+        self.release()
         self._dropped = True
         self._bare = self._opened()
         if self._bare.lost:
@@ -358,13 +358,13 @@ class RigSession:
         opened as before where either fails. Raises what they raise.
         """
         before, self._open_rig = self._open_rig, open_rig
-        self.let_go()
+        self.release()
         try:
             self.open()
             kept()
         except BaseException:
             self._open_rig = before
-            self.let_go()
+            self.release()
             self.try_open()
             raise
 
@@ -377,12 +377,12 @@ class RigSession:
         return None
 
     def recover(self) -> Exception | None:
-        """Open the rig again, once, if it was let go because of a failure; return why that cannot be done."""
+        """Open the rig again, once, if it was closed because of a failure; return why that cannot be done."""
         self._drop_failed()
         return self.try_open() if self._dropped else None
 
     def darken(self) -> None:
-        """Make the projector dark. One that will not is let go with all other devices."""
+        """Make the projector dark. If that fails, close all devices."""
         if self._rig is None:
             return
         try:
@@ -390,7 +390,7 @@ class RigSession:
                 self._rig.projector.blank()
         except Exception as error:  # noqa: BLE001 - a driver may raise anything, and must not end the owner thread
             _log.error("the projector does not go dark; the rig is closed", rig=self.name, cause=repr(error))
-            self.let_go(error)
+            self.release(error)
 
     def darken_from_outside(self) -> None:
         """Try to make the projector dark past the thread that owns it: for when that one does not come back."""
@@ -409,7 +409,7 @@ class RigSession:
         last_resort.start()
         last_resort.join(_LAST_RESORT_S)
 
-    def let_go(self, error: BaseException | None = None) -> None:
+    def release(self, error: BaseException | None = None) -> None:
         """Close every device. `error` says why, where that is a failure."""
         rig, self._rig = self._rig, None
         if error is not None:
@@ -420,7 +420,7 @@ class RigSession:
             self._bare = None
 
     def give_up(self, call: Call) -> JobFailure:
-        """Take note that a call hangs, and return what to tell of it. It ends the rig when it returns after all."""
+        """Note that a call hangs, and return its fault. It ends the rig when it returns after all."""
         fault = self.fault = job_failure(DeviceError(call.hangs()))
         return fault
 

@@ -1,6 +1,6 @@
 """Devices as the service calls them: errors name device and call, no call hangs unnoticed, settings are remembered.
 
-Drivers raise what the operating system gives them; a record needs words that a person can act on. A call that does not
+Drivers raise errors of the operating system; a record needs a message that a person can act on. A call that does not
 return, because a driver or the kernel hangs, must not leave a job under way with the projector's light on.
 """
 
@@ -58,44 +58,44 @@ from slrig.printable import foreign_text
 
 @dataclass(frozen=True, slots=True)
 class SettingsInUse:
-    """applied : what the camera read back; None before it took any. refused : why it did not take what was asked for
-    last, and so goes on with the settings before.
+    """applied : as read back from the camera; None before it took any. refused : why it did not take the latest
+    settings, and so goes on with those before.
     """
 
-    asked: CameraSettings
+    requested: CameraSettings
     applied: AppliedSettings | None
     refused: str | None = None
 
     @property
-    def words(self) -> tuple[str, ...]:
-        """What a person should know of them, a sentence each; none where the camera uses what was asked for.
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for a person; none where the camera uses what was requested.
 
-        >>> SettingsInUse(CameraSettings(0.02), AppliedSettings(0.015, 1.0)).words
-        ('It was asked for an exposure of 20 ms, and uses 15 ms: write a value that it can use into the rig file.',)
+        >>> SettingsInUse(CameraSettings(0.02), AppliedSettings(0.015, 1.0)).notes
+        ('It uses an exposure of 15 ms instead of 20 ms: write a value that it can use into the rig file.',)
         """
         if self.refused is not None:
-            return (f"It refused what it was asked for last: {self.refused}",)
+            return (f"It refused the latest settings: {self.refused}",)
         if self.applied is None:
             return ()
-        asked, uses, told = self.asked, self.applied, []
-        if differs_from_request(uses.exposure_s, asked.exposure_s):
-            told.append(f"an exposure of {1e3 * asked.exposure_s:.4g} ms, and uses {1e3 * uses.exposure_s:.4g} ms")
-        if differs_from_request(uses.gain, asked.gain):
-            told.append(f"a gain of {asked.gain:.4g}, and uses {uses.gain:.4g}")
-        return tuple(f"It was asked for {each}: write a value that it can use into the rig file." for each in told)
+        wanted, uses, found = self.requested, self.applied, []
+        if differs_from_request(uses.exposure_s, wanted.exposure_s):
+            found.append(f"an exposure of {1e3 * uses.exposure_s:.4g} ms instead of {1e3 * wanted.exposure_s:.4g} ms")
+        if differs_from_request(uses.gain, wanted.gain):
+            found.append(f"a gain of {uses.gain:.4g} instead of {wanted.gain:.4g}")
+        return tuple(f"It uses {each}: write a value that it can use into the rig file." for each in found)
 
 
 OPEN = "open"
 """The step of opening a whole rig."""
 
 OPEN_LIMIT_S = 60.0
-"""How long opening a rig may take without telling of progress: network cameras are looked for, some projectors boot."""
+"""Longest time to open a rig without a report of progress: network cameras are searched, some projectors boot."""
 
 MOVE_LIMIT_S = 120.0
-"""How long a move of the board may take: a stage crosses its whole travel, a robot goes round an obstacle."""
+"""Longest move of the board: a stage crosses its whole travel, a robot goes round an obstacle."""
 
-LOOK_S = 0.5
-"""How often the watchdog looks."""
+CHECK_S = 0.5
+"""Interval of the watchdog's checks."""
 
 _GONE = {errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN}
 
@@ -107,8 +107,8 @@ _Device = TypeVar("_Device", bound=Camera | Projector)
 
 @dataclass(slots=True)
 class Call:
-    """A call of a device that is under way. `since_s` : when it was begun, or last told how far it is; `doing` : what
-    it told; `late` : how often it was found to be; `given_up` : nobody waits for it.
+    """A call of a device that is under way. `since_s` : when it was begun, or last reported progress; `doing` : that
+    report; `late` : number of checks that found it late; `given_up` : its result is no longer awaited.
     """
 
     device: str
@@ -121,14 +121,14 @@ class Call:
     given_up: bool = False
 
     def hangs(self) -> str:
-        """What to tell of a call that does not return."""
+        """Message about a call that does not return."""
         what = f"{self.device}: its driver has not come back from {self.step} for {self.limit_s:.0f} s"
         if self.computed:
-            return f"{what}, nor told how far it is; restart the service, and report this to the driver's maintainer"
+            return f"{what}, nor reported progress; restart the service, and report this to the driver's maintainer"
         if self.step == OPEN:
             return (
-                f"{what}, nor told how far it is; restart the service, after unplugging and plugging in again what of "
-                "the rig is on a cable, and report this to the driver's maintainer"
+                f"{what}, nor reported progress; unplug every device of the rig that is on a cable and plug it in "
+                "again, restart the service, and report this to the driver's maintainer"
             )
         return (
             f"{what} and does not keep its time-out; unplug the device, plug it in again and scan again; if that is "
@@ -137,31 +137,31 @@ class Call:
 
 
 class Calls:
-    """Whatever is asked of a rig's devices goes through here: one call at a time by the thread that owns the rig, and
-    beside it one by each thread that reads a camera for it. Any thread may look.
+    """Makes all calls of a rig's devices: one at a time by the thread that owns the rig, and one by each thread that
+    reads a camera for it. Any thread may read its state.
     """
 
     def __init__(self, *, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s = now_s
         self._current: dict[int, Call] = {}
         self.failure: DeviceError | None = None
-        """The last error of a device that leaves its state unknown, also where whoever called passed over it."""
+        """The last error of a device that leaves its state unknown, also where the caller ignored it."""
 
     def make(
         self, device: str, step: str, limit_s: float, function: Callable[[], _Value], *, computed: bool = False
     ) -> _Value:
-        """Call a device. It may take limit_s without telling how far it is. computed : see `CallLimits`.
+        """Call a device. It may take limit_s without a report of progress. computed : see `CallLimits`.
 
         Raises
         ------
         SlrigError
             What the driver raised, with the device and the call in its text.
         DeviceBusyError, DeviceGoneError, DeviceError
-            What the system told the driver, by its number.
+            The system's error of the driver, by its number.
         DriverBrokenError
             The driver has a defect.
         DeviceError
-            The call took so long that it was given up; nobody waits for its result any more.
+            The call took so long that it was given up; its result is no longer awaited.
         """
         call = Call(device, step, limit_s, self._now_s(), computed)
         self._current[threading.get_ident()] = call
@@ -174,7 +174,7 @@ class Calls:
                 value = function()
         except SlrigError as raised:
             error = _plain(raised)
-            # Whoever opens a device names it; and capture tells of a frame that did not come in words of its own.
+            # The code that opens a device names it; and capture has its own message for a frame that did not come.
             if isinstance(error, DeviceError) and not isinstance(error, FrameTimeoutError) and step != OPEN:
                 error.place = f"{device}, in {step}"
             self._note(error)
@@ -184,16 +184,16 @@ class Calls:
             self._note(found)
             raise found from error
         except BaseException as error:
-            # Whatever a driver raises, sys.exit among it: this thread is the service's, and goes on.
+            # A driver may raise anything, even SystemExit: this thread is the service's, and goes on.
             if call.given_up:
                 self.failure = DeviceError(call.hangs())
                 raise self.failure from error
             # A driver may raise the same error again and again, and not every renderer bears the ring that this makes.
             trace = foreign_text("".join(_trace(error)))
             _log.error("a driver failed with an error of its own", device=device, step=step, exception=trace)
-            words = f"{type(error).__name__}: {foreign_text(error)}"
+            cause = f"{type(error).__name__}: {foreign_text(error)}"
             message = (
-                f"{device}: its driver failed in {step} ({words}); scan again, and report it to the driver's "
+                f"{device}: its driver failed in {step} ({cause}); scan again, and report it to the driver's "
                 "maintainer with the service's log"
             )
             self.failure = DriverBrokenError(message)
@@ -206,8 +206,8 @@ class Calls:
         return value
 
     def overdue(self) -> Call | None:
-        """Return the call under way if it has taken too long, once, and give it up. For the watchdog, which looks twice
-        before it believes that: the whole process may have been stopped meanwhile.
+        """Return the call under way if it has taken too long, once, and give it up. For the watchdog, which checks
+        twice before it believes that: the whole process may have been stopped meanwhile.
         """
         for call in self._under_way():
             if call.given_up or self._now_s() - call.since_s <= call.limit_s:
@@ -220,7 +220,7 @@ class Calls:
 
     @property
     def doing(self) -> str:
-        """What a call under way has told that it is at; "" where none has told anything."""
+        """Latest report of a call under way; "" without one."""
         return next((call.doing for call in self._under_way() if call.doing), "")
 
     @property
@@ -239,25 +239,25 @@ class Calls:
 
 
 class Watchdog:
-    """Looks after the calls of a rig on a thread of its own; `on_hang` is told there of each one that hangs, once."""
+    """Supervises the calls of a rig on a thread of its own; `on_hang` gets each one that hangs there, once."""
 
-    def __init__(self, calls: Calls, on_hang: Callable[[Call], None], *, look_s: float = LOOK_S) -> None:
+    def __init__(self, calls: Calls, on_hang: Callable[[Call], None], *, check_s: float = CHECK_S) -> None:
         self._calls = calls
         self._on_hang = on_hang
-        self._look_s = look_s
+        self._check_s = check_s
         self._ended = threading.Event()
         self._thread = LastingThread(self._watch, "slrig-watchdog")
 
     def start(self) -> None:
-        """Begin to look."""
+        """Begin to check."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Look no more. Idempotent."""
+        """Stop. Idempotent."""
         self._ended.set()
 
     def _watch(self) -> None:
-        while not self._ended.wait(self._look_s):
+        while not self._ended.wait(self._check_s):
             call = self._calls.overdue()
             if call is not None:
                 try:
@@ -293,7 +293,7 @@ def _guarded_positioner(positioner: Positioner | None, calls: Calls) -> GuardedP
 
 
 class _Guarded(Generic[_Device]):
-    """A device whose calls go by way of `calls`. name : what errors call it."""
+    """A device called by way of `calls`. name : its name in errors."""
 
     def __init__(self, device: _Device, name: str, calls: Calls) -> None:
         self._device = device
@@ -419,13 +419,13 @@ class GuardedPositioner:
         self._positioner = positioner
         self._made = partial(calls.make, "the positioner")
 
-    def _told(self, step: str, function: Callable[[], _Value]) -> _Value:
+    def _read(self, step: str, function: Callable[[], _Value]) -> _Value:
         return self._made(step, DEFAULT_LIMITS.call_s, function)
 
     @property
     def poses(self) -> Sequence[str]:
         """See `Positioner`."""
-        return self._told("poses", lambda: require_texts(self._positioner.poses))
+        return self._read("poses", lambda: require_texts(self._positioner.poses))
 
     def move(self, index: int) -> None:
         """See `Positioner`."""
@@ -451,7 +451,7 @@ class GuardedTurntable(GuardedPositioner):
             found = self._turntable.axis
             return None if found is None else require_kind(found, RotationAxis)
 
-        return self._told("axis", axis)
+        return self._read("axis", axis)
 
     @property
     def angles_deg(self) -> Sequence[float]:
@@ -460,7 +460,7 @@ class GuardedTurntable(GuardedPositioner):
         def angles_deg() -> Sequence[float]:
             return tuple(require_number(each, _ANGLE) for each in self._turntable.angles_deg)
 
-        return self._told("angles_deg", angles_deg)
+        return self._read("angles_deg", angles_deg)
 
     @property
     def opened_at_deg(self) -> float | None:
@@ -470,7 +470,7 @@ class GuardedTurntable(GuardedPositioner):
             found = self._turntable.opened_at_deg
             return None if found is None else require_number(found, _ANGLE)
 
-        return self._told("opened_at_deg", opened_at_deg)
+        return self._read("opened_at_deg", opened_at_deg)
 
     def turn(self, angle_deg: float) -> None:
         """See `Turntable`."""
@@ -500,17 +500,17 @@ def _trace(error: BaseException) -> list[str]:
 
 
 def _of_the_system(error: OSError, call: Call) -> DeviceError:
-    """What the system told a driver, in words that a person can act on."""
-    device, step, told = call.device, call.step, foreign_text(error)
+    """The system's error of a driver, with advice for a person."""
+    device, step, cause = call.device, call.step, foreign_text(error)
     number = error.errno if isinstance(error.errno, int) else None
     if call.computed:
-        return DeviceError(f"{device} failed in {step}: {told}; check its files and their permissions, then scan again")
+        return DeviceError(f"{device} failed in {step}: {cause}; check its files and permissions, then scan again")
     if number == errno.EBUSY:
         return DeviceBusyError(
-            f"{device} is held by another program (in {step}: {told}); end that program, then scan again"
+            f"{device} is held by another program (in {step}: {cause}); end that program, then scan again"
         )
     if number in _GONE:
         return DeviceGoneError(
-            f"{device} is gone (in {step}: {told}); check its cable and power, plug it in, then scan again"
+            f"{device} is gone (in {step}: {cause}); check its cable and power, plug it in, then scan again"
         )
-    return DeviceError(f"{device} failed in {step}: {told}; check cable, power and permissions, then scan again")
+    return DeviceError(f"{device} failed in {step}: {cause}; check cable, power and permissions, then scan again")

@@ -319,7 +319,7 @@ def test_positions_of_one_test_are_measured_with_one_calibration(desk: Desk) -> 
     camera = RIG.cameras["left"]
     other = replace(camera, translation_mm=camera.translation_mm + 1)
     desk.manager.bare = replace(desk.manager.bare, calibration=Calibration({"left": other}, RIG.projector))
-    desk.manager.rig.let_go()
+    desk.manager.rig.release()
     desk.measure(test.id, wait=False, scripted=False)
     assert failure_code(desk, test.id) == CalibrationStateError.code
     assert len(desk.get(test.id).readings) == PLAN.repeats

@@ -53,7 +53,7 @@ def test_rig_says_what_it_is_and_how_its_cameras_are_set(client: TestClient, ser
     (camera,) = client.get("/rig").json()["cameras"]
     settings.clear()
     assert (camera["exposure_s"], camera["gain"]) == (0.01, 1.0)
-    assert "asked for an exposure of 20 ms, and uses 10 ms" in camera["notes"][0]
+    assert "uses an exposure of 10 ms instead of 20 ms" in camera["notes"][0]
 
 
 def test_a_webhook_is_set_by_request_and_its_address_is_not_told(client: TestClient) -> None:

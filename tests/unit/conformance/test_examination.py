@@ -304,7 +304,7 @@ def test_a_check_that_hangs_ends_the_job_and_leaves_the_checks_before_it_on_reco
     hanging: type[Hangs], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(job, "run_checks", partial(run_checks, limit_s=0.2))
-    monkeypatch.setattr(managing, "Watchdog", partial(Watchdog, look_s=0.02))
+    monkeypatch.setattr(managing, "Watchdog", partial(Watchdog, check_s=0.02))
     data = DataFolder(tmp_path / "data")
     database = Database(data.database)
     rig = RigSession("model", Maker(hanging))

@@ -200,7 +200,7 @@ def test_watchdog_barks_once_for_each_call_that_hangs() -> None:
         now_s[0] += 2.0
         assert heard.wait(WAIT_S)
 
-    dog = Watchdog(calls, on_hang, look_s=0.001)
+    dog = Watchdog(calls, on_hang, check_s=0.001)
     dog.start()
     for step in ("show", "blank"):
         heard.clear()
@@ -402,18 +402,18 @@ def test_settings_are_kept_as_applied_with_what_was_refused_or_bent() -> None:
             eye.configure(CameraSettings(0.02, 9.0))
         found = kept["cam0"]
         assert found.applied == (AppliedSettings(0.01, 1.0) if taken else None)
-        assert found.words == (
-            "It refused what it was asked for last: asked for gain 9, it takes 1 only (camera 'cam0', in configure)",
+        assert found.notes == (
+            "It refused the latest settings: asked for gain 9, it takes 1 only (camera 'cam0', in configure)",
         )
         camera.configure = usual  # type: ignore[method-assign]
         eye.configure(CameraSettings(0.01))
-        assert (kept["cam0"].applied, kept["cam0"].words) == (AppliedSettings(0.01, 1.0), ())
+        assert (kept["cam0"].applied, kept["cam0"].notes) == (AppliedSettings(0.01, 1.0), ())
         camera.configure = refuse  # type: ignore[method-assign]
     camera.configure = bend  # type: ignore[method-assign]
     eye.configure(CameraSettings(0.01))
-    assert kept["cam0"].words == (
-        "It was asked for an exposure of 10 ms, and uses 9 ms: write a value that it can use into the rig file.",
-        "It was asked for a gain of 1, and uses 2: write a value that it can use into the rig file.",
+    assert kept["cam0"].notes == (
+        "It uses an exposure of 9 ms instead of 10 ms: write a value that it can use into the rig file.",
+        "It uses a gain of 2 instead of 1: write a value that it can use into the rig file.",
     )
 
 
@@ -421,8 +421,8 @@ def test_settings_of_a_rig_that_is_opened_afresh_are_not_those_of_before() -> No
     bench = TameBench()
     held = RigSession("bench", bench.open_rig)
     next(iter(held.open().cameras.values())).configure(CameraSettings(0.01))
-    assert [each.asked.exposure_s for each in held.settings.values()] == [0.01]
-    held.let_go()
+    assert [each.requested.exposure_s for each in held.settings.values()] == [0.01]
+    held.release()
     held.open()
     assert held.settings == {}
 

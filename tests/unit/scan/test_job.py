@@ -157,7 +157,7 @@ def test_rig_that_was_let_go_is_opened_once_more_and_says_how_that_went() -> Non
     bench = TameBench()
     rig = RigSession("bench", bench.open_rig)
     rig.open()
-    rig.let_go(DeviceGoneError("Camera 'cam0' was unplugged."))
+    rig.release(DeviceGoneError("Camera 'cam0' was unplugged."))
     bench.open_error = DeviceGoneError("No camera on usb-3.")
     assert rig.recover() is bench.open_error
     assert fault_of(rig) == "No camera on usb-3."
@@ -165,7 +165,7 @@ def test_rig_that_was_let_go_is_opened_once_more_and_says_how_that_went() -> Non
     assert rig.recover() is None
     assert len(bench.opened) == 1, "one failure is answered by one opening"
     rig.open()
-    rig.let_go(DeviceGoneError("Camera 'cam0' was unplugged."))
+    rig.release(DeviceGoneError("Camera 'cam0' was unplugged."))
     assert rig.recover() is None
     assert fault_of(rig) is None
     assert len(bench.opened) == 3
