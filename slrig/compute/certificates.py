@@ -19,16 +19,16 @@ from slrig.errors import ConfigError
 from slrig.jobs.records import utc_now
 
 AUTHORITY_KEY = "authority-key.pem"
-"""Whoever has it can join the pool; it stays where it was made."""
+"""Key that admits members to the pool; it stays on the machine that made it."""
 
 AUTHORITY_DAYS, MACHINE_DAYS = 3650, 825
 """825 days is the longest that systems take a server's certificate for (CA/Browser Forum, ballot 193)."""
 
 LONGEST_NAME = 64
-"""Of a common name in a certificate: RFC 5280, ub-common-name."""
+"""Longest common name of a certificate: RFC 5280, ub-common-name."""
 
 _CLOCKS = timedelta(hours=1)
-"""How far the clock of a machine may be behind."""
+"""Largest delay of a machine's clock."""
 
 
 def make_certificates(folder: Path, names: Sequence[str]) -> list[Path]:
@@ -38,14 +38,14 @@ def make_certificates(folder: Path, names: Sequence[str]) -> list[Path]:
     Raises
     ------
     ConfigError
-        A name is no name for a folder, or the authority's files cannot be read.
+        A name is not valid for a folder, or the authority's files cannot be read.
     StorageError
         The disk refused.
     """
     for name in names:
         if not name.replace("-", "").replace("_", "").isalnum() or len(name) > LONGEST_NAME:
             message = (
-                f"'{name}' is no name for a machine: expected letters, digits, - and _, {LONGEST_NAME} of them at "
+                f"'{name}' cannot name a machine: expected letters, digits, - and _, {LONGEST_NAME} of them at "
                 "most, such as rig-7."
             )
             raise ConfigError(message)

@@ -39,7 +39,7 @@ from slrig.compute.link import (
     Withdrawal,
     cause,
     connect,
-    run_until_told,
+    run_until_stopped,
 )
 from slrig.compute.security import PoolAddress, require_private
 from slrig.config import is_loopback, read_private_text
@@ -57,13 +57,13 @@ if TYPE_CHECKING:
     from obstore.store import ClientConfig, ObjectStore, RetryConfig
 
 CHUNK_BYTES = 5 * 2**20
-"""The least part of S3's uploads in parts, but for the last."""
+"""The least part of S3's uploads in parts, except the last."""
 
 _AT_ONCE = 1
 """Parts under way at a time: more of them would share the line, and none be through in its time."""
 
 _CLIENT: ClientConfig = {"connect_timeout": "3s", "timeout": "20s"}
-"""Of one request, which carries one chunk: 2 Mbit/s will do."""
+"""Limits of one request, which carries one chunk: 2 Mbit/s will do."""
 
 _RETRIES: RetryConfig = {"max_retries": 2, "retry_timeout": timedelta(seconds=15)}
 
@@ -72,7 +72,7 @@ Check = Callable[[], None]
 
 
 class PoolStore:
-    """`address` is told to people; `objects` is what it stands for."""
+    """The store of a pool. address : for messages. objects : its contents."""
 
     def __init__(self, address: str, objects: ObjectStore) -> None:
         self.address = address
@@ -88,7 +88,7 @@ class PoolStore:
         StorageError
             This machine's disk refused.
         """
-        # Beside the bundle, where there is room; it has no name, and is gone however this ends.
+        # Next to the bundle, where there is room; it has no name, and is always removed at the end.
         with storage_errors(bundle.parent), tempfile.TemporaryFile(dir=bundle.parent) as packed:
             with tarfile.open(fileobj=packed, mode="w") as archive:
                 for path in sorted(bundle.rglob("*")):
@@ -126,7 +126,7 @@ class PoolStore:
         """
         for name, digest in hashes.items():
             if Path(name).name != name or name.startswith("."):
-                message = f"the pool names a result '{name}', which is no name of a file"
+                message = f"the pool names a result '{name}', which is not a file name"
                 raise PoolError(message)
             part = folder / f".{name}.part"
             try:
@@ -153,7 +153,7 @@ class PoolStore:
         obstore.put(self._objects, path, chunks, chunk_size=CHUNK_BYTES, max_concurrency=_AT_ONCE)
 
     def _delete(self, path: str) -> None:
-        # A folder tells that there is none; S3 does not.
+        # A folder reports a missing file; S3 does not.
         with suppress(FileNotFoundError):
             obstore.delete(self._objects, path)
 
@@ -223,7 +223,7 @@ def open_store(address: str, login: Path | None = None) -> PoolStore:
     elif not (os.environ.get("AWS_ACCESS_KEY_ID") and os.environ.get("AWS_SECRET_ACCESS_KEY")):
         message = (
             f"{address}: there are no credentials for it. Set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or "
-            "compute_login_file, a file with KEY ID:SECRET that nobody else may read."
+            "compute_login_file, a file with KEY ID:SECRET that only this user may read."
         )
         raise ConfigError(message)
     options["region"] = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION") or "us-east-1"
@@ -255,7 +255,7 @@ def _result(job: str, name: str) -> str:
 
 
 def _add(archive: tarfile.TarFile, path: Path, name: str) -> None:
-    """Add a file such that the same bytes give the same archive, whoever wrote them and when."""
+    """Add a file such that the same bytes give the same archive, without owner and time."""
     entry = tarfile.TarInfo(name)
     entry.size = path.stat().st_size
     with path.open("rb") as file:
@@ -269,8 +269,8 @@ def _chunks(file: IO[bytes], check: Check) -> Iterator[bytes]:
         check()
 
 
-TELL_S = 0.2
-"""How often a stage's progress is told at most: each time passes through this machine, the scheduler and the rig."""
+REPORT_S = 0.2
+"""Least interval of reports of a stage's progress: each passes through this machine, the scheduler and the rig."""
 
 _VERSIONS = Task(versions, what="statement of versions")
 
@@ -278,7 +278,7 @@ _log = structlog.get_logger(__name__)
 
 
 class PoolTask(Message):
-    """What a machine does for rigs, and all that it does: the second part of a scan. bundle : its key in the store."""
+    """The only task of a pool's worker: the second part of a scan. bundle : its key in the store."""
 
     name: Literal["scan"] = "scan"
     id: UUID
@@ -295,14 +295,14 @@ class Host:
         self._worker = worker
         self._clock = clock
 
-    def done(self, order: PoolRequest, tell: Callable[[Progress], None], stop: threading.Event) -> PoolResponse:
-        """Do an order, until `stop` is set. tell : takes progress. Whatever goes wrong is in the answer."""
+    def done(self, order: PoolRequest, report: Callable[[Progress], None], stop: threading.Event) -> PoolResponse:
+        """Do an order, until `stop` is set. report : takes progress. Failures are in the answer."""
         try:
-            return self._computed(order, tell, stop)
+            return self._computed(order, report, stop)
         except (PoolError, WorkerLostError) as error:
             # A process that is lost, as where memory runs out, is the machine's fault rather than the task's.
             fault = JobFailure(POOL_FAULT, str(error))
-        except BaseException as error:  # noqa: BLE001 - a panic of obstore, too: the rig is told, and computes by itself
+        except BaseException as error:  # noqa: BLE001 - a panic of obstore, too: the rig then computes by itself
             if not isinstance(error, ScanCancelledError):
                 _log.warning("an order came to nothing", job=order.job, cause=repr(error))
             fault = job_failure(error)
@@ -310,14 +310,14 @@ class Host:
             self._store.clear(job=order.job)
         return PoolResponse(job=order.job, fault=fault)
 
-    def _computed(self, order: PoolRequest, tell: Callable[[Progress], None], stop: threading.Event) -> PoolResponse:
+    def _computed(self, order: PoolRequest, report: Callable[[Progress], None], stop: threading.Event) -> PoolResponse:
         try:
             given = PoolTask.model_validate(order.task)
         except ValueError as error:
-            message = "the order is no task of a pool, and is not done"
+            message = "the order is not a task of a pool, and is not done"
             raise PoolError(message) from error
         _log.info("computes for a rig", job=order.job, what=given.name)
-        tell(Progress(job=order.job))
+        report(Progress(job=order.job))
         # Of the process that computes: after an update of the files beneath, it is newer than this one.
         if self._worker.run(_VERSIONS, Listener(cancelled=stop.is_set)) != order.versions:
             message = "the machine's versions of slrig and its libraries have changed; start slrig worker again"
@@ -329,15 +329,15 @@ class Host:
                 raise ScanCancelledError(message)
 
         with tempfile.TemporaryDirectory(prefix="slrig-pool-") as scratch:
-            last, told_s = "", 0.0
+            last, reported_s = "", 0.0
 
             def progress(stage: str, fraction: float, detail: str) -> None:
-                nonlocal last, told_s
-                if stage == last and self._clock() - told_s < TELL_S:
+                nonlocal last, reported_s
+                if stage == last and self._clock() - reported_s < REPORT_S:
                     return
-                last, told_s = stage, self._clock()
-                told = detail.replace(f"{scratch}/", "")
-                tell(Progress(job=order.job, stage=stage, fraction=fraction, detail=told))
+                last, reported_s = stage, self._clock()
+                shown = detail.replace(f"{scratch}/", "")
+                report(Progress(job=order.job, stage=stage, fraction=fraction, detail=shown))
 
             run = JobRun(given.id, Path(scratch), None, evidence=given.evidence)
             task = replace(
@@ -359,14 +359,14 @@ class Host:
                         made(path.name)
                 files = {name: sent[name].result() for name in sorted(sent)}
                 answer = PoolResponse(job=order.job, result=result, files=files)
-                answer.model_dump_json()  # raises here, rather than where nobody would tell the rig
+                answer.model_dump_json()  # raises here, where the rig is still informed
                 return answer
             finally:
                 line.shutdown(cancel_futures=True)
 
 
 RETURN_S = 2.0
-"""How often a worker looks for its scheduler."""
+"""Interval at which a worker tries to reach its scheduler."""
 
 
 async def join(address: PoolAddress, host: Host, *, say: Callable[[str], None]) -> None:
@@ -375,11 +375,11 @@ async def join(address: PoolAddress, host: Host, *, say: Callable[[str], None]) 
     say(f"computes for the pool {address}. Ctrl-C stops it.")
     stop, doing, job = threading.Event(), set[asyncio.Task[None]](), ""
 
-    def tell(progress: Progress) -> None:
+    def report(progress: Progress) -> None:
         loop.call_soon_threadsafe(link.send, progress)
 
     async def do(order: PoolRequest) -> None:
-        link.send(await asyncio.to_thread(host.done, order, tell, stop))
+        link.send(await asyncio.to_thread(host.done, order, report, stop))
 
     def heard(message: Message) -> None:
         nonlocal stop, job
@@ -393,7 +393,7 @@ async def join(address: PoolAddress, host: Host, *, say: Callable[[str], None]) 
     try:
         await link.hear(heard)
     finally:
-        # Nobody waits for it: the scheduler gives it to another one.
+        # Its result is not awaited: the scheduler gives it to another one.
         link.close()
         stop.set()
         await asyncio.gather(*doing, return_exceptions=True)
@@ -407,12 +407,12 @@ def serve_worker(address: PoolAddress, store: PoolStore, *, cache: Path, say: Ca
     beneath = Worker(PIPELINE)
 
     async def life() -> None:
-        told = ""
+        reported = ""
 
-        def tell(found: str) -> None:
-            nonlocal told
-            if found != told:
-                say(told := found)
+        def report(found: str) -> None:
+            nonlocal reported
+            if found != reported:
+                say(reported := found)
 
         # A rig would wait for kernels to be compiled.
         while beneath.condition != READY:
@@ -422,24 +422,24 @@ def serve_worker(address: PoolAddress, store: PoolStore, *, cache: Path, say: Ca
         while True:
             try:
                 # A job at a time: the process beneath has one, and machines with more cores run more workers.
-                await join(address, Host(store, beneath), say=tell)
-                tell(f"the scheduler {address} is gone")
+                await join(address, Host(store, beneath), say=report)
+                report(f"the scheduler {address} is gone")
             except (OSError, PoolError, ConfigError) as error:
-                tell(f"the scheduler {address} does not answer: {cause(error)}")
+                report(f"the scheduler {address} does not answer: {cause(error)}")
             await asyncio.sleep(RETURN_S)
 
     try:
         with _scratch():
             beneath.start()
-            run_until_told(life)
+            run_until_stopped(life)
     finally:
         beneath.close()
 
 
 @contextmanager
 def _scratch() -> Iterator[None]:
-    """Have what this process and those beneath it put into TMPDIR lie in a folder of its own there, and remove what a
-    worker of the same user left that was killed.
+    """A folder of its own in TMPDIR for the temporary files of this process and its children; removes those that killed
+    workers of the same user left.
     """
     place = Path(tempfile.gettempdir(), f"slrig-workers-{os.geteuid()}")
     with storage_errors(place):

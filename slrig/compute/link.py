@@ -1,5 +1,5 @@
-"""What members of a pool say to one another: JSON objects, one a line, over TLS for which both ends show certificates.
-They are data: nothing that comes is code, or is loaded as such.
+"""Messages between members of a pool: JSON objects, one a line, over TLS for which both ends show certificates. They
+are data: nothing that comes is code, or is loaded as such.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CONNECT_S = 5.0
 """The longest that a scheduler may take to answer, and a connection to end: it does nothing else."""
 
 BEAT_S = 2.0
-"""How often each end says that it is there."""
+"""Interval of each end's heartbeat."""
 
 LOST_S = 10.0
 """From when on an end that was not heard of is given up."""
@@ -47,7 +47,7 @@ class PoolError(Exception):
 
 
 class Message(BaseModel):
-    """What crosses a connection. Others than these end it."""
+    """Base of the messages of a connection. Any other message ends it."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="constants")
 
@@ -148,7 +148,7 @@ class Link:
         OSError
             The connection broke, or nothing came for `LOST_S`.
         PoolError
-            What came is no message, the other end refuses this one, or `heard` raised it.
+            An invalid message came, the other end refuses this one, or `heard` raised it.
         """
         beating = asyncio.create_task(self._beat())
         try:
@@ -171,7 +171,7 @@ class Link:
                     line = await self._reader.readline()
             return _MESSAGE.validate_json(line) if line else None
         except ValueError as error:
-            message = "what came is no message of a pool; have the same version of slrig on all of its machines"
+            message = "the other end sent no valid message; install one version of slrig on all machines of the pool"
             raise PoolError(message) from error
 
     async def _beat(self) -> None:
@@ -181,7 +181,7 @@ class Link:
 
 
 def cause(error: Exception) -> str:
-    """Why a connection failed, in words."""
+    """Why a connection failed, for people."""
     if isinstance(error, ssl.SSLError):
         return f"the certificates of the two ends have ended, or are not of one authority ({error.reason})"
     return str(error) or type(error).__name__
@@ -198,7 +198,7 @@ async def connect(address: PoolAddress, hello: Hello) -> Link:
     return link
 
 
-def run_until_told(life: Callable[[], Awaitable[None]]) -> None:
+def run_until_stopped(life: Callable[[], Awaitable[None]]) -> None:
     """Run until SIGTERM or Ctrl-C, which cancel."""
 
     async def live() -> None:

@@ -49,8 +49,8 @@ from slrig.jobs.worker import POLL_S, Compute, JobFiles, Task, Worker
 from slrig.model import Region
 from slrig.scan.job import ScanJob
 
-LOOK_S = 2.0
-"""How often a pool that is not there is looked for."""
+RETRY_S = 2.0
+"""Interval of attempts to reach a missing pool."""
 
 _log = structlog.get_logger(__name__)
 
@@ -78,19 +78,19 @@ class PoolClient:
         """Wait at most so long until orders can be given; return whether they can."""
         return self._usable.wait(timeout_s)
 
-    def submit(self, order: PoolRequest, told: SimpleQueue[Progress]) -> Future[PoolResponse]:
-        """Give an order, which is withdrawn where the future is cancelled. Its exception is a PoolError. told : takes
-        progress. Raises PoolError.
+    def submit(self, order: PoolRequest, reports: SimpleQueue[Progress]) -> Future[PoolResponse]:
+        """Give an order, which is withdrawn where the future is cancelled. Its exception is a PoolError. reports :
+        takes progress. Raises PoolError.
         """
         if not self.usable():
             raise PoolError(self.fault)
         coming: Future[PoolResponse] = Future()
         coming.add_done_callback(partial(self._call, self._forget, order.job))
-        self._call(self._give, order, told, coming)
+        self._call(self._give, order, reports, coming)
         return coming
 
     def close(self) -> None:
-        """Let the pool go. Idempotent."""
+        """Leave the pool. Idempotent."""
         if self._life is not None:
             self._call(self._life.cancel)
             self._thread.join(CONNECT_S)
@@ -111,7 +111,7 @@ class PoolClient:
             try:
                 self._link = await connect(self._address, Hello())
                 await self._link.hear(self._heard)
-            except Exception as error:  # noqa: BLE001 - whatever it is, this machine computes
+            except Exception as error:  # noqa: BLE001 - after any error this machine computes
                 fault = f"the pool {self._address} does not answer: {cause(error)}"
             finally:
                 if self._link is not None:
@@ -121,7 +121,7 @@ class PoolClient:
             while self._orders:
                 _, (_, coming) = self._orders.popitem()
                 _settle(coming, PoolError(f"the pool lost the job: {fault}"))
-            await asyncio.sleep(LOOK_S)
+            await asyncio.sleep(RETRY_S)
 
     def _heard(self, message: Message) -> None:
         match message:
@@ -133,7 +133,7 @@ class PoolClient:
                 _settle(self._orders.pop(job)[1], message)
 
     def _lack(self, found: list[dict[str, str]]) -> str | None:
-        """What the pool lacks, None if orders can be given. found : the versions of its workers."""
+        """Reason why the pool takes no orders, None if it does. found : the versions of its workers."""
         if not found:
             return f"the pool {self._address} has no workers"
         if dict(versions()) not in found:
@@ -151,11 +151,11 @@ class PoolClient:
         self.fault = fault
         self._usable.clear()
 
-    def _give(self, order: PoolRequest, told: SimpleQueue[Progress], coming: Future[PoolResponse]) -> None:
+    def _give(self, order: PoolRequest, reports: SimpleQueue[Progress], coming: Future[PoolResponse]) -> None:
         if self._link is None:
             _settle(coming, PoolError(self.fault))
         else:
-            self._orders[order.job] = told, coming
+            self._orders[order.job] = reports, coming
             self._link.send(order)
 
     def _forget(self, job: str, _coming: Future[PoolResponse]) -> None:
@@ -173,7 +173,7 @@ def _settle(coming: Future[PoolResponse], answer: PoolResponse | PoolError) -> N
 
 
 TRIES = 2
-"""How often a job is given to the pool, as when its worker was lost."""
+"""Most times that a job is given to the pool, as when its worker was lost."""
 
 BEGIN_LIMIT_S = 30.0
 """A job that has not begun so long is withdrawn: others are before it, and this machine takes it 2 to 9 s."""
@@ -184,7 +184,7 @@ TRANSFER_LIMIT_S = 120.0
 WAITING = "waiting for the pool"
 
 RETURN_LIMIT_S = 5.0
-"""How long a pool that lost a job is waited for: a scheduler that is started again is back in two."""
+"""Longest wait for a pool that lost a job: a restarted scheduler is back in two seconds."""
 
 
 class PooledWorker:
@@ -198,12 +198,12 @@ class PooledWorker:
         self._store = store
         self._clock = clock
         self._closed = False
-        # Nobody waits for the store to be tidied.
+        # Tidied in the background.
         self._tidying = ThreadPoolExecutor(1, thread_name_prefix="slrig-store")
 
     @property
     def condition(self) -> str:
-        """Of this machine's own process: without it nothing is certain to be computed."""
+        """Condition of this machine's own process: without it nothing is certain to be computed."""
         return self._local.condition
 
     @property
@@ -233,7 +233,7 @@ class PooledWorker:
         within_s: float | None = None,
     ) -> Any:
         """See `Compute`. Raises what the local process raises, and nothing else."""
-        # A call of `ScanJob.compute`, of which the pool is told the plan alone.
+        # A call of `ScanJob.compute`, of which the pool gets the plan alone.
         job = getattr(task.function, "__self__", None)
         if isinstance(job, ScanJob) and task.files is not None:
             try:
@@ -277,10 +277,10 @@ class PooledWorker:
 
     def _tried(self, task: Task, wanted: PoolTask, result: Path, listener: Listener) -> Any:
         order = PoolRequest(job=uuid4().hex, versions=dict(versions()), task=wanted.model_dump(mode="json"))
-        told: SimpleQueue[Progress] = SimpleQueue()
-        coming = self._pool.submit(order, told)
+        reports: SimpleQueue[Progress] = SimpleQueue()
+        coming = self._pool.submit(order, reports)
         try:
-            answer = self._answer(task, coming, told, listener)
+            answer = self._answer(task, coming, reports, listener)
             if answer.fault is not None:
                 raise PoolError(answer.fault.message, final=answer.fault.code != POOL_FAULT)
             for name in self._store.fetch_result(order.job, answer.files, result, self._check(task, listener)):
@@ -291,15 +291,15 @@ class PooledWorker:
             self._tidy(partial(self._store.clear, job=order.job))
 
     def _answer(
-        self, task: Task, coming: Future[PoolResponse], told: SimpleQueue[Progress], listener: Listener
+        self, task: Task, coming: Future[PoolResponse], reports: SimpleQueue[Progress], listener: Listener
     ) -> PoolResponse:
         given_s, begun = self._clock(), False
         while True:
             answer = None
             with suppress(TimeoutError):
                 answer = coming.result(POLL_S)
-            while not told.empty():
-                heard, begun = told.get(), True
+            while not reports.empty():
+                heard, begun = reports.get(), True
                 if heard.stage:
                     listener.report(heard.stage, heard.fraction, heard.detail)
             if answer is not None:
@@ -318,7 +318,7 @@ class PooledWorker:
             raise PoolError(message)
 
     def _check(self, task: Task, listener: Listener) -> Callable[[], None]:
-        """What ends a transfer to or from the store that begins now."""
+        """A check that ends a transfer to or from the store that begins now."""
         until_s = self._clock() + TRANSFER_LIMIT_S
 
         def check() -> None:
@@ -330,7 +330,7 @@ class PooledWorker:
         return check
 
     def _tidy(self, tidied: Callable[[], None]) -> None:
-        """Have something done in the store by and by. What stays there when that fails is for the store to expire."""
+        """Run a removal in the store in the background. If it fails, the store expires the object."""
 
         def tidy() -> None:
             try:
@@ -343,7 +343,7 @@ class PooledWorker:
 
 
 def pooled(settings: ServiceSettings, local: Worker) -> PooledWorker:
-    """The worker of a service whose settings name a pool. Raises ConfigError."""
+    """The worker of a service that uses a pool. Raises ConfigError."""
     if settings.compute is None or settings.compute_store is None:
         message = "compute: a pool needs a store as well, compute_store. Set both, or neither."
         raise ConfigError(message)

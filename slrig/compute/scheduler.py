@@ -30,7 +30,7 @@ from slrig.compute.link import (
     Versions,
     Withdrawal,
     Workers,
-    run_until_told,
+    run_until_stopped,
 )
 from slrig.compute.security import MEMBER, PoolAddress, require_private
 from slrig.disk import storage_errors
@@ -42,14 +42,14 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(slots=True)
 class Given:
-    """An order of a rig. rig : None once nobody wants it any more."""
+    """An order of a rig. rig : None once it is no longer wanted."""
 
     order: PoolRequest
     rig: Link | None
 
 
 class Scheduler:
-    """Of one event loop; `heard` and `gone` are all that happens to it."""
+    """Gives orders of rigs to workers; for one event loop. `heard` and `gone` are its only events."""
 
     def __init__(self) -> None:
         self._rigs: set[Link] = set()
@@ -58,7 +58,7 @@ class Scheduler:
         self._doing: dict[Link, Given] = {}
 
     async def attend(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serve a member, whose certificate has been checked, until it is gone."""
+        """Serve a member with a checked certificate until it is gone."""
         link = Link(reader, writer)
         try:
             await link.hear(partial(self.heard, link))
@@ -81,7 +81,7 @@ class Scheduler:
                 link.send(self._roster())
             case Hello(versions=versions) if versions is not None:
                 self._workers[link] = versions
-                self._tell_rigs()
+                self._inform_rigs()
             case PoolRequest() if link in self._rigs:
                 self._waiting.append(Given(message, link))
             case Withdrawal(job=job) if link in self._rigs:
@@ -99,7 +99,7 @@ class Scheduler:
         self._give()
 
     def gone(self, link: Link) -> None:
-        """A member is gone: its rig is told of what it did, and nobody does what it ordered."""
+        """Handle the loss of a member: inform the rig that it worked for, and withdraw its own orders."""
         self._rigs.discard(link)
         self._withdraw(lambda given: given.rig is link)
         if self._workers.pop(link, None) is None:
@@ -108,7 +108,7 @@ class Scheduler:
         if given is not None and given.rig is not None:
             # It knows what is to be done: it gives the order again, or computes by itself.
             given.rig.send(PoolResponse(job=given.order.job, fault=JobFailure(POOL_FAULT, "its worker was lost")))
-        self._tell_rigs()
+        self._inform_rigs()
         self._give()
 
     def _withdraw(self, unwanted: Callable[[Given], bool]) -> None:
@@ -119,7 +119,7 @@ class Scheduler:
                 worker.send(Withdrawal(job=given.order.job))
 
     def _give(self) -> None:
-        """Have each worker that is free do the first order that it can."""
+        """Give each free worker the first order that it can do."""
         for worker, versions in self._workers.items():
             if worker in self._doing:
                 continue
@@ -133,7 +133,7 @@ class Scheduler:
         found = {tuple(versions.items()): versions for versions in self._workers.values()}
         return Workers(versions=list(found.values()))
 
-    def _tell_rigs(self) -> None:
+    def _inform_rigs(self) -> None:
         roster = self._roster()
         for rig in self._rigs:
             rig.send(roster)
@@ -165,11 +165,11 @@ def serve_scheduler(address: PoolAddress, *, say: Callable[[str], None]) -> None
         finally:
             server.close()
 
-    run_until_told(life)
+    run_until_stopped(life)
 
 
 def _renew(folder: Path) -> None:
-    """Make new certificates in a folder that nobody else reads. Raises ConfigError, StorageError."""
+    """Make new certificates in a folder that only this user can read. Raises ConfigError, StorageError."""
     with storage_errors(folder):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         require_private(folder)

@@ -1,5 +1,5 @@
-"""Who may join a pool: its address, and the certificates that its members show to one another. There is no pool without
-TLS: other users of a machine, and containers on it, reach 127.0.0.1 as well.
+"""Access to a pool: its address, and the certificates that its members show to one another. A pool needs TLS: other
+users of a machine, and containers on it, reach 127.0.0.1 as well.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def require_pool_extra() -> None:
 
 @dataclass(frozen=True, slots=True)
 class PoolAddress:
-    """Where a pool's scheduler is. certificates : folder of this machine's; None: those of `own_folder`."""
+    """Address of a pool's scheduler. certificates : folder of this machine's; None: those of `own_folder`."""
 
     host: str
     port: int
@@ -42,12 +42,12 @@ class PoolAddress:
 
     @property
     def own_folder(self) -> Path:
-        """Where the scheduler at this port leaves certificates for members of its user on its machine."""
+        """Folder of the scheduler at this port with certificates for members of its user on its machine."""
         base = os.environ.get("XDG_RUNTIME_DIR") or os.environ.get("XDG_STATE_HOME")
         return Path(base or Path.home() / ".local" / "state", f"slrig-pool-{self.port}")
 
     def tls(self, *, listens: bool) -> ssl.SSLContext:
-        """What a member shows and asks for, read now: certificates may have been renewed. Raises ConfigError."""
+        """TLS context of a member, read now: certificates may have been renewed. Raises ConfigError."""
         folder = self.certificates
         if folder is None:
             folder = self.own_folder / MEMBER
@@ -71,7 +71,7 @@ class PoolAddress:
         purpose = ssl.Purpose.CLIENT_AUTH if listens else ssl.Purpose.SERVER_AUTH
         try:
             found = ssl.create_default_context(purpose, cafile=authority)
-            # Who has a certificate of the authority is a member, whatever its name.
+            # Every holder of a certificate of the authority is a member, under any name.
             found.check_hostname, found.verify_mode = False, ssl.CERT_REQUIRED
             found.minimum_version = ssl.TLSVersion.TLSv1_3
             found.load_cert_chain(certificate, key)
@@ -98,7 +98,7 @@ def pool_address(address: str, certificates: Path | None) -> PoolAddress:
         )
         raise ConfigError(message)
     if parts.scheme != "tls" or not parts.hostname or port is None:
-        message = f"'{address}' is no address of a pool's scheduler: expected tls://HOST:PORT, such as tls://pool:8786."
+        message = f"'{address}' is not an address of a scheduler: expected tls://HOST:PORT, such as tls://pool:8786."
         raise ConfigError(message)
     if certificates is None and not is_loopback(parts.hostname):
         message = (
@@ -117,5 +117,5 @@ def require_private(folder: Path) -> None:
     with storage_errors(folder):
         found = folder.lstat()
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
-        message = f"{folder} belongs to somebody else, or others may use it. Remove it, or have it be elsewhere."
+        message = f"{folder} belongs to another user, or others may use it. Remove it, or name another place."
         raise ConfigError(message)

@@ -22,7 +22,7 @@ pytest.importorskip("cryptography", reason="needs a pool's libraries: pip instal
 import obstore
 from obstore.store import MemoryStore
 
-from slrig.compute.host import CHUNK_BYTES, TELL_S, Host, PoolStore, PoolTask, _scratch, join, open_store
+from slrig.compute.host import CHUNK_BYTES, REPORT_S, Host, PoolStore, PoolTask, _scratch, join, open_store
 from slrig.compute.link import (
     POOL_FAULT,
     PoolError,
@@ -321,7 +321,7 @@ def is_full(pool: Pool) -> None:
         (is_lost_twice, 2, "lost the job"),
         (is_lost_for_good, 1, "lost the job"),
         (answers_wrong_bytes, 2, "not what was put there"),
-        (names_a_file_elsewhere, 2, "no name of a file"),
+        (names_a_file_elsewhere, 2, "not a file name"),
         (is_slow, 0, "took longer than"),
         (is_full, 0, r"failed \(GenericError\)"),
     ],
@@ -390,7 +390,7 @@ def test_a_pool_is_used_while_a_worker_has_this_machines_versions() -> None:
 
 def test_workers_use_no_folder_of_another_user(place: Path) -> None:
     place.chmod(0o755)
-    with pytest.raises(ConfigError, match=f"{place.name} belongs to somebody else"), _scratch():
+    with pytest.raises(ConfigError, match=f"{place.name} belongs to another user"), _scratch():
         pass
 
 
@@ -491,7 +491,7 @@ def test_progress_is_sent_at_intervals(pool: Pool, tmp_path: Path, monkeypatch: 
             return versions()
         for number in range(10):
             listener.report("read bundle", number / 10, "")
-            pool.now_s += TELL_S / 3.9
+            pool.now_s += REPORT_S / 3.9
         listener.report("decode", 1.0, "")
         return None
 
