@@ -31,7 +31,7 @@ def encode_e57(cloud: OrganisedCloud) -> bytes:
     ExtraMissingError
         pye57 is not installed.
     NothingToReconstructError
-        There is no point.
+        There are no points.
     StorageError
         The folder for temporary files cannot be written; the library writes files only.
     """

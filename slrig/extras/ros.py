@@ -75,12 +75,12 @@ def encode_bag(
         # Writes FOLDER/FOLDER.mcap.
         folder = Path(parent, Path(FORMAT.name).stem)
         with storage_errors(folder):
-            # From version 9 on QoS is stated in words, which Humble does not read; later releases read both.
+            # From version 9 on QoS is stated as text, which Humble does not read; later releases read both.
             writer = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)
             # As chunks of the MCAP, which any reader of the format unpacks.
             writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
             with writer:
-                # Names that differ in what ROS's do not have share a topic; frames tell them apart.
+                # Names that differ in what ROS's do not have share a topic; frames distinguish them.
                 topics: dict[str, Any] = {}
 
                 def write(where: str, message: Any) -> None:

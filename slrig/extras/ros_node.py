@@ -1,7 +1,7 @@
 """A ROS 2 node that scans for an action or a service, and publishes the result.
 
 `python -m slrig.extras.ros_node --ros-args -p url:=http://scanner:8731` where ROS is set up. No action among ROS's own
-has the goal, feedback and result of a scan, so `~/scan` is a `slrig_interfaces/action/Scan` where the package beside
+has the goal, feedback and result of a scan, so `~/scan` is a `slrig_interfaces/action/Scan` where the package next to
 this file was built. As a `std_srvs/srv/Trigger`, which has neither progress nor cancel, `~/scan` needs no build.
 """
 
@@ -31,15 +31,15 @@ from slrig.ros_messages import PROJECTOR, TF_STATIC, WORLD, Device, Messages, to
 NODE = "slrig"
 _THREADS = 32
 """More than scans that wait in the service's line (`queue_length`, 16), so that none keeps another callback waiting."""
-_LOOK_S = 0.25
-"""How often goals are looked at: rclpy notes that one is to be cancelled only after it has asked whether it may be."""
+_CHECK_S = 0.25
+"""Interval of checks of goals: rclpy marks one as to be cancelled only after it has asked whether it may be."""
 _AGAIN_S = 2.0
 """Until live depth that ended is begun again."""
 _ADVICE = {
     "rig-busy": " A goal with queue: true waits.",
     "service": " To this node an address is given by -p url:=http://HOST:8731.",
 }
-"""What is added to an error where a person has this node before them. By its code."""
+"""Advice added to an error for users of this node, by its code."""
 
 
 @dataclass(eq=False, slots=True)
@@ -52,8 +52,8 @@ class _Run:
 
 
 class ScanNode:
-    """What the node does. node : rclpy's, which offers it. world : the frame of the points. live : a camera whose live
-    depth is published while somebody subscribes to `~/CAMERA/live`; empty for none.
+    """The node's services. node : rclpy's, which offers them. world : the frame of the points. live : a camera with
+    live depth published while `~/CAMERA/live` has subscribers; empty for none.
 
     Raises
     ------
@@ -78,9 +78,9 @@ class ScanNode:
             _class_of(kind)
         if live:
             Thread(target=self._show_live, args=(live,), name="slrig-live", daemon=True).start()
-        beside = ReentrantCallbackGroup()
-        node.create_service(_class_of("std_srvs/srv/Trigger"), "~/scan", self.answer, callback_group=beside)
-        node.create_timer(_LOOK_S, self._look, callback_group=beside)
+        concurrent = ReentrantCallbackGroup()
+        node.create_service(_class_of("std_srvs/srv/Trigger"), "~/scan", self.answer, callback_group=concurrent)
+        node.create_timer(_CHECK_S, self._check, callback_group=concurrent)
         try:
             self._action = _class_of("slrig_interfaces/action/Scan")
         except ExtraMissingError as error:
@@ -88,7 +88,7 @@ class ScanNode:
             return
         accept = CancelResponse.ACCEPT
         ActionServer(
-            node, self._action, "~/scan", self.execute, callback_group=beside, cancel_callback=lambda _: accept
+            node, self._action, "~/scan", self.execute, callback_group=concurrent, cancel_callback=lambda _: accept
         )
 
     def answer(self, _request: Any, response: Any) -> Any:
@@ -103,20 +103,20 @@ class ScanNode:
         return response
 
     def execute(self, goal: Any) -> Any:
-        """Scan as a goal says, tell how far it is, publish, and return the action's result."""
-        asked, result, told = goal.request, self._action.Result(), self._action.Feedback()
+        """Scan as a goal says, send feedback, publish, and return the action's result."""
+        request, result, feedback = goal.request, self._action.Result(), self._action.Feedback()
         try:
-            names = {"label": asked.label or None, "preset": asked.preset or None}
-            busy = "queue" if asked.queue else "reject"
+            names = {"label": request.label or None, "preset": request.preset or None}
+            busy = "queue" if request.queue else "reject"
             with self._scan(lambda: goal.is_cancel_requested, if_busy=busy, **names) as job:
                 result.scan_id = job.id
                 for event in job:
                     if isinstance(event, Progress):
-                        told.stage, told.fraction = event.stage, event.fraction
+                        feedback.stage, feedback.fraction = event.stage, event.fraction
                     elif isinstance(event, StateChange):
-                        told.stage = event.state
-                    told.rig_free |= isinstance(event, Captured)
-                    goal.publish_feedback(told)
+                        feedback.stage = event.state
+                    feedback.rig_free |= isinstance(event, Captured)
+                    goal.publish_feedback(feedback)
                 self.publish(job.result())
         except SlrigError as error:
             result.code, result.message = error.code, self._fault(error)
@@ -147,7 +147,7 @@ class ScanNode:
         """Cancel all scans. `stopped` is done when they have ended."""
         self._stopping.set()
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         for run in list(self._runs):
             if run.job and not run.is_cancelled and (self._stopping.is_set() or run.is_unwanted()):
                 run.is_cancelled = True
@@ -159,13 +159,13 @@ class ScanNode:
             self.stopped.set_result(None)
 
     def _fault(self, error: SlrigError) -> str:
-        """What is said of an error here."""
+        """Message of an error for users of this node."""
         message = f"{error}{_ADVICE.get(error.code, '')}"
         self._node.get_logger().error(message)
         return message
 
     def publish(self, result: ScanResult) -> None:
-        """Publish where the devices stand, on a robot too where that is known, how each sees, and the points of each
+        """Publish the poses of the devices, on a robot too where known, their camera models, and the points of each
         camera, stamped with the time at which the scan began. Raises ServiceError.
         """
         calibration = json.loads(self._client.scans.file(result.id, "calibration.json"))
@@ -180,11 +180,11 @@ class ScanNode:
                     self._send(topic(name, "points", under="~"), messages.points(result.cloud(name)))
 
     def _show_live(self, camera: str) -> None:
-        """Publish live depth while somebody subscribes. On a thread of its own."""
+        """Publish live depth while there are subscribers. On a thread of its own."""
         where = topic(camera, "live", under="~")
         publisher = self._node.create_publisher(_class_of("sensor_msgs/msg/PointCloud2"), where, 1)
         while not self._stopping.is_set():
-            self._stopping.wait(_LOOK_S)
+            self._stopping.wait(_CHECK_S)
             if not publisher.get_subscription_count():
                 continue
             try:
@@ -203,7 +203,7 @@ class ScanNode:
         if where not in self._publishers:
             from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-            # Latched: scans are rare, and who subscribes between two of them gets the last.
+            # Latched: scans are rare, and a later subscriber gets the last.
             latched = QoSProfile(
                 depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE
             )
@@ -218,8 +218,8 @@ def _devices(calibration: Mapping[str, Any]) -> dict[str, Device]:
         found[PROJECTOR] = calibration["projector"]
     names = "matrix", "distortion", "rotation", "translation_mm"
     return {
-        name: Device(*told["size_px"], *(np.array(told[each], dtype=np.float64) for each in names))
-        for name, told in found.items()
+        name: Device(*stated["size_px"], *(np.array(stated[each], dtype=np.float64) for each in names))
+        for name, stated in found.items()
     }
 
 
@@ -249,7 +249,7 @@ def _class_of(kind: str) -> Any:
 
 
 def _sequence(numbers: NDArray[Any]) -> array.array[Any]:
-    # Anything else is looked at number by number in Python, which takes seconds of a cloud.
+    # Anything else is converted number by number in Python, which takes seconds of a cloud.
     found = array.array(numbers.dtype.char)
     found.frombytes(numbers.tobytes())
     return found

@@ -39,7 +39,7 @@ def traces_by_environment() -> Traces | None:
         from opentelemetry.sdk.trace.export import BatchSpanProcessor
     except ImportError as error:
         message = (
-            f"{named} asks for traces, and OpenTelemetry's library is not installed ({error}). Install it with: "
+            f"{named} requests traces, and OpenTelemetry's library is not installed ({error}). Install it with: "
             f"pip install 'slrig[telemetry]', or unset {named}."
         )
         raise ConfigError(message) from error

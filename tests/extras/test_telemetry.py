@@ -143,7 +143,7 @@ def test_nothing_is_sent_without_a_collector(monkeypatch: pytest.MonkeyPatch, na
 def test_missing_library_is_named_with_its_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, EXPORTER, None)
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "http://127.0.0.1:1/v1/traces")
-    with pytest.raises(ConfigError, match=r"TRACES_ENDPOINT asks for traces.*pip install 'slrig\[telemetry\]'"):
+    with pytest.raises(ConfigError, match=r"TRACES_ENDPOINT requests traces.*pip install 'slrig\[telemetry\]'"):
         traces_by_environment()
 
 
