@@ -24,7 +24,7 @@ from slrig.api.schemas import ScanRequest, scan_plan
 from slrig.api.shares import Makings, Shares
 from slrig.calibrate.job import CalibrationArchive, Calibrations
 from slrig.calibrate.verification import RigHealth, require_healthy
-from slrig.catalogue.store import Copier, catalogue_of, standing
+from slrig.catalogue.store import Copier, catalogue_of, rig_row
 from slrig.config import RigConfig, ServiceSettings
 from slrig.discovery import DeviceSearch
 from slrig.doctor import EXAMINATIONS, Examinations
@@ -284,8 +284,8 @@ class Service:
         catalogue, copies = catalogue_of(self.settings), self.store.outbox.copies
         if catalogue is None or copies is None:
             return None
-        told = partial(standing, self.manager, self.health, data=self.folder.root.resolve(), started_at=utc_now())
-        return Copier(catalogue, copies, told)
+        rig = partial(rig_row, self.manager, self.health, data=self.folder.root.resolve(), started_at=utc_now())
+        return Copier(catalogue, copies, rig)
 
     def _ended(self, record: JobRecord) -> None:
         """Measure a job that is over, make room, and go on with the model that a scan is a view of."""

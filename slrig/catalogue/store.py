@@ -76,7 +76,7 @@ class Moment(TypeDecorator[datetime]):
 
 
 NUMBER = BigInteger().with_variant(Integer, "sqlite")
-"""Of rows. SQLite counts by itself in columns of type INTEGER alone."""
+"""Type of the rows' numbers. SQLite counts by itself in columns of type INTEGER alone."""
 
 
 class CatalogueBase(DeclarativeBase):
@@ -84,11 +84,11 @@ class CatalogueBase(DeclarativeBase):
 
 
 class RigRow(CatalogueBase):
-    """How a rig was at `seen_at`, by the catalogue's own clock. All else is by the rig's.
+    """State of a rig at `seen_at`, by the catalogue's own clock. All else is by the rig's.
 
-    origin : machine and data folder of the service that writes the row. words : what it does, or why it cannot.
-    waiting : for the rig. computing : scans whose frames are computed with, or wait for that. uncopied : jobs that
-    ended and are not here yet. health : of its calibration, by what was verified last at `verified_at`.
+    origin : machine and data folder of the service that writes the row. words : its activity or fault, as text.
+    waiting : for the rig. computing : scans that are computed, or wait for that. uncopied : jobs that ended and are not
+    here yet. health : of its calibration, by the verification at `verified_at`.
     """
 
     __tablename__ = "rig"
@@ -110,8 +110,8 @@ class RigRow(CatalogueBase):
 
 
 class FinishedJobRow(CatalogueBase):
-    """One job that ended; `number` is the order in which they came, of one rig the order in which they ended. What
-    each column holds `slrig.jobs.store.told` says.
+    """One job that ended; `number` is the order in which they came, of one rig the order in which they ended. The
+    columns: see `slrig.jobs.store.catalogue_entry`.
     """
 
     __tablename__ = "finished_job"
@@ -142,10 +142,10 @@ class FinishedJobRow(CatalogueBase):
 
 
 BEAT_S = 20.0
-"""How often a rig says how it is."""
+"""Interval at which a rig reports its state."""
 
-SEEN_S = 3 * BEAT_S
-"""Until when that is believed: one beat may be late, and one be lost."""
+VALID_S = 3 * BEAT_S
+"""Validity of a report: one may be late, and one be lost."""
 
 STOPPED, UNSEEN = "stopped", "unseen"
 
@@ -163,10 +163,10 @@ class LastScan:
 
 @dataclass(frozen=True, slots=True)
 class RigStanding:
-    """A rig of the fleet. seen_s : how long ago it was seen, by the catalogue's clock. state : ready, busy, opening,
-    fault; stopped, where its service ended in good order; unseen, where it was not seen for a minute. What it does, its
-    backlog and its health are None or empty then: nobody knows. words : what it does, or why it cannot. waiting : for
-    the rig. computing : scans that are reconstructed, or wait for that. uncopied : ended jobs that are still to be
+    """A rig of the fleet. seen_s : seconds since its last report, by the catalogue's clock. state : ready, busy,
+    opening, fault; stopped, where its service ended in good order; unseen, without a report for a minute. Its activity,
+    backlog and health are unknown then: None or empty. words : its activity or fault, as text. waiting : for the rig.
+    computing : scans that are reconstructed, or wait for that. uncopied : ended jobs that are still to be
     copied. verified_at : when its calibration was verified last. scans_of_day : that ended within 24 hours.
     """
 
@@ -209,7 +209,7 @@ _MOMENTS = ("created_at", "started_at", "finished_at")
 
 
 class Catalogue:
-    """address : as it is told to people. Any thread may call; two at a time have a connection.
+    """address : for messages. Any thread may call; two at a time have a connection.
 
     All calls raise CatalogueError: the database cannot be reached, refuses, or was made by a newer slrig.
     """
@@ -235,12 +235,12 @@ class Catalogue:
             raise CatalogueError(message)
 
     def close(self) -> None:
-        """Let the connections go; the next call makes new ones. Idempotent."""
+        """Close the connections; the next call makes new ones. Idempotent."""
         self._engine.dispose()
 
     def copy(self, jobs: Sequence[Mapping[str, Any]]) -> None:
-        """Have the catalogue know jobs in this order, all of them or none. One that it knows is brought up to date."""
-        # The last word on a job stands: one statement may not change a row twice.
+        """Write jobs in this order, all of them or none. Known ones are updated."""
+        # Only the last entry of a job: one statement may not change a row twice.
         rows = {job["job"]: {name: _value(name, value) for name, value in job.items()} for job in jobs}
         statement = self._insert(FinishedJobRow).values(list(rows.values()))
         new = {name: statement.excluded[name] for name in next(iter(rows.values())) if name != "job"}
@@ -253,12 +253,12 @@ class Catalogue:
             return set(connection.scalars(select(FinishedJobRow.job).where(FinishedJobRow.job.in_(jobs))))
 
     def see(self, rig: Mapping[str, Any]) -> None:
-        """Note how a rig is now: the columns of its row but for `seen_at`."""
+        """Record a rig's state: the columns of its row except `seen_at`."""
         with self._changing() as connection:
             now = _now(connection)
             statement = self._insert(RigRow).values(seen_at=now, **rig)
-            # A row that somebody else keeps up to date is somebody else's.
-            mine = or_(RigRow.origin == rig["origin"], RigRow.seen_at < now - timedelta(seconds=SEEN_S))
+            # A row that another service keeps up to date is not ours.
+            mine = or_(RigRow.origin == rig["origin"], RigRow.seen_at < now - timedelta(seconds=VALID_S))
             new = {name: statement.excluded[name] for name in (*rig, "seen_at")}
             kept = connection.execute(
                 statement.on_conflict_do_update(index_elements=["name"], set_=new, where=mine).returning(RigRow.name)
@@ -298,7 +298,7 @@ class Catalogue:
                 .group_by(job.rig)
             ).all()
             of_day = {rig: (count, failed) for rig, count, failed in counts}
-            found = tuple(_standing(row, now, *of_day.get(row["name"], (0, 0))) for row in rigs)
+            found = tuple(_fleet_rig(row, now, *of_day.get(row["name"], (0, 0))) for row in rigs)
         return Fleet(catalogue=self.address, rigs=found)
 
     @contextmanager
@@ -323,8 +323,8 @@ class Catalogue:
 def open_catalogue(address: str, login: str | None, authority: Path | None) -> Catalogue:
     """The catalogue at postgresql://HOST:PORT/DATABASE or sqlite:///FILE. Does not connect yet.
 
-    login : USER:PASSWORD. authority : a file with the certificate of who signed the server's; None stands for those
-    that this system trusts.
+    login : USER:PASSWORD. authority : a file with the certificate of the server's signer; None for those that this
+    system trusts.
 
     Raises
     ------
@@ -353,8 +353,8 @@ def open_catalogue(address: str, login: str | None, authority: Path | None) -> C
     user, found, password = (login or "").strip().partition(":")
     if not found or not user:
         message = (
-            "catalogue: there is no login for it. Set catalogue_login_file, a file with USER:PASSWORD that nobody "
-            "else may read, or SLRIG_CATALOGUE_LOGIN in the environment."
+            "catalogue: there is no login for it. Set catalogue_login_file, a file with USER:PASSWORD that only "
+            "this user may read, or SLRIG_CATALOGUE_LOGIN in the environment."
         )
         raise ConfigError(message)
     try:
@@ -374,11 +374,11 @@ def open_catalogue(address: str, login: str | None, authority: Path | None) -> C
             "timeout": PATIENCE_S,
             "application_name": "slrig",
             "ssl_context": _tls(parts.hostname, authority),
-            # The server, too, gives up what takes long, and lets go the locks of a rig that is cut off.
+            # The server, too, gives up what takes long, and releases the locks of a rig that is cut off.
             "startup_params": dict.fromkeys(_BOUNDS, str(int(1000 * PATIENCE_S))),
         },
     )
-    # It tells at length, with statements, of each connection that was lost; we tell it ourselves.
+    # It logs each lost connection at length, with statements; we log it ourselves.
     logging.getLogger(f"sqlalchemy.pool.impl.QueuePool.{_POOL}").setLevel(logging.CRITICAL)
     return Catalogue(f"postgresql://{parts.hostname}:{port}/{database}", engine)
 
@@ -392,7 +392,7 @@ def catalogue_of(settings: ServiceSettings) -> Catalogue | None:
 
 
 def _tls(host: str, authority: Path | None) -> ssl.SSLContext | bool:
-    """How a server proves who it is; False, without encryption, on this machine alone. Raises ConfigError."""
+    """Check of the server's identity; False, without encryption, on this machine alone. Raises ConfigError."""
     if authority is None:
         return False if is_loopback(host) else ssl.create_default_context()
     try:
@@ -420,11 +420,11 @@ def _value(name: str, value: Any) -> Any:
     return value.replace("\0", "\\0").encode("utf-8", "backslashreplace").decode()
 
 
-def _standing(row: Mapping[Any, Any], now: datetime, scans: int, failed: int) -> RigStanding:
-    """A rig as it was when it was seen last, as far as that still says something."""
+def _fleet_rig(row: Mapping[Any, Any], now: datetime, scans: int, failed: int) -> RigStanding:
+    """A rig by its last report, as far as that is still valid."""
     seen_s = max((now - row["seen_at"]).total_seconds(), 0.0)
-    stopped, seen = row["state"] == STOPPED, seen_s <= SEEN_S
-    current = seen and not stopped
+    stopped = row["state"] == STOPPED
+    current = seen_s <= VALID_S and not stopped
     last = None
     if row["job"] is not None:
         last = LastScan(row["job"], row["label"], row["scan_state"], row["finished_at"], row["fault_message"])
@@ -452,8 +452,8 @@ def _standing(row: Mapping[Any, Any], now: datetime, scans: int, failed: int) ->
 def _cause(error: Exception) -> str:
     """Why, without statements, which hold what people wrote."""
     if isinstance(error, NoConnectionError):
-        return "others ask it just now"
-    # Of a connection that could not be made the driver tells the attempt, and the system why.
+        return "its connections are in use just now"
+    # Of a connection that could not be made the driver names the attempt, and the system the cause.
     found: BaseException = error.orig if isinstance(error, DBAPIError) and error.orig is not None else error
     root = found.__cause__ if isinstance(found.__cause__, OSError) else found
     if isinstance(root, ssl.SSLCertVerificationError):
@@ -464,10 +464,10 @@ def _cause(error: Exception) -> str:
         return root.strerror or type(root).__name__
     if root is error:
         return type(error).__name__
-    # Postgres's own words, by the names of its protocol's fields.
+    # Postgres's own message, by the names of its protocol's fields.
     answer = root.args[0] if root.args else ""
-    words = str(answer.get("M", "") if isinstance(answer, Mapping) else answer)
-    return printable(words.replace("network error", "the connection was lost")).rstrip(".")
+    text = str(answer.get("M", "") if isinstance(answer, Mapping) else answer)
+    return printable(text.replace("network error", "the connection was lost")).rstrip(".")
 
 
 BATCH = 200
@@ -475,7 +475,7 @@ BATCH = 200
 
 FIRST_WAIT_S = 1.0
 LONGEST_WAIT_S = 30.0
-"""Between tries. A thousand rigs whose catalogue is away then ask it thirty times a second."""
+"""Between tries. A thousand rigs then try thirty times a second to reach a missing catalogue."""
 
 _END_S = 1.0
 
@@ -484,8 +484,8 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Copying:
-    """How the copying goes. fault : why not, None while it does. waiting, oldest_s : jobs that are not copied, and how
-    long the oldest has waited.
+    """State of the copying. fault : why it fails, None while it works. waiting, oldest_s : jobs that are not copied,
+    and how long the oldest has waited.
     """
 
     fault: str | None
@@ -494,9 +494,9 @@ class Copying:
 
 
 class Copier:
-    """Tells the catalogue. Nothing waits for it, but `close`, for a second at most.
+    """Copies a rig's state and jobs to the catalogue. Only `close` waits for it, for a second at most.
 
-    standing : gives how the rig is, by the columns of its row but for `seen_at` and `uncopied`. clock : seconds that
+    rig_row : gives the rig's state, by the columns of its row except `seen_at` and `uncopied`. clock : seconds that
     only grow.
     """
 
@@ -504,19 +504,19 @@ class Copier:
         self,
         catalogue: Catalogue,
         copies: Copies,
-        standing: Callable[[], Mapping[str, Any]],
+        rig_row: Callable[[], Mapping[str, Any]],
         *,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._catalogue = catalogue
         self._copies = copies
-        self._standing = standing
+        self._rig_row = rig_row
         self._clock = clock
         self._opened = False
         self._fault: str | None = "It was not reached yet"
         self._failures = 0
         self._beat_at_s = -float("inf")
-        self._told_uncopied = 0
+        self._reported_uncopied = 0
         self._left = threading.Event()
         self._ending = threading.Event()
         self._thread = LastingThread(self._run, "slrig-catalogue")
@@ -534,11 +534,11 @@ class Copier:
         self._left.set()
 
     def status(self) -> Copying:
-        """How it goes. Raises StorageError."""
+        """State of the copying. Raises StorageError."""
         return Copying(self._fault, *self._copies.waiting())
 
     def fleet(self) -> Fleet:
-        """Every rig of the catalogue. Asks nothing of one that is away: raises CatalogueError at once."""
+        """Every rig of the catalogue. Raises CatalogueError at once where the last attempt failed."""
         if self._fault is not None:
             message = f"{self._fault}. This rig scans on, and tries again by itself."
             raise CatalogueError(message)
@@ -549,7 +549,7 @@ class Copier:
         try:
             return self._catalogue.fleet()
         except CatalogueError as error:
-            # Nobody else is to wait for it before it was reached again.
+            # Others do not wait for it before it was reached again.
             self._fault = str(error).rstrip(".")
             self._copies.news.set()
             raise
@@ -569,19 +569,19 @@ class Copier:
             if self._left.is_set():
                 break
             self._copies.taken(copies)
-            self._say_how_it_is()
-        self._say_how_it_is()
+            self._report()
+        self._report()
         return self._beat_at_s + BEAT_S - self._clock()
 
-    def _say_how_it_is(self, **other: Any) -> None:
-        """If that is due, or the backlog that was told last is gone."""
+    def _report(self, **other: Any) -> None:
+        """Report the rig's state if that is due, or once the last reported backlog is gone."""
         uncopied, _ = self._copies.waiting()
-        if other or self._clock() >= self._beat_at_s + BEAT_S or (self._told_uncopied and not uncopied):
-            self._catalogue.see({**self._standing(), "uncopied": uncopied, **other})
-            self._beat_at_s, self._told_uncopied = self._clock(), uncopied
+        if other or self._clock() >= self._beat_at_s + BEAT_S or (self._reported_uncopied and not uncopied):
+            self._catalogue.see({**self._rig_row(), "uncopied": uncopied, **other})
+            self._beat_at_s, self._reported_uncopied = self._clock(), uncopied
 
     def _copy_what_it_lacks(self) -> None:
-        """Bring up what ended before there was this catalogue, or what it lost: it may be an older backup of itself."""
+        """Copy jobs that ended before this catalogue existed, or that it lost: it may be an older backup of itself."""
         ended = self._copies.ended()
         for begin in range(0, len(ended), BATCH):
             if self._left.is_set():
@@ -603,33 +603,33 @@ class Copier:
         if self._fault is None:
             with suppress(CatalogueError, StorageError):
                 self.step()
-                self._say_how_it_is(state=STOPPED, words="")
+                self._report(state=STOPPED, words="")
         self._catalogue.close()
 
     def _tried(self) -> float:
         try:
             wait_s = self.step()
-        except Exception as error:  # noqa: BLE001 - whatever it was, the next try may go well
+        except Exception as error:  # noqa: BLE001 - after any error the next try may succeed
             known = isinstance(error, (CatalogueError, StorageError))
             fault = str(error).rstrip(".") if known else f"The catalogue cannot be used: {type(error).__name__}"
             wait_s = min(FIRST_WAIT_S * 2.0 ** min(self._failures, 30), LONGEST_WAIT_S)
             self._failures += 1
             if fault != self._fault:
-                _log.warning("the catalogue is not told of this rig", cause=fault, exc_info=not known)
+                _log.warning("this rig is not reported to the catalogue", cause=fault, exc_info=not known)
             self._fault, self._opened = fault, False
             self._catalogue.close()
             return wait_s
         if self._fault is not None:
-            _log.info("the catalogue is told of this rig", catalogue=self._catalogue.address)
+            _log.info("this rig is reported to the catalogue", catalogue=self._catalogue.address)
         self._fault, self._failures = None, 0
         return wait_s
 
 
-def standing(manager: JobManager, health_of: RigHealth, *, data: Path, started_at: datetime) -> dict[str, Any]:
-    """The columns of a rig's row, but for when it is seen and what is not copied. data : the service's folder."""
+def rig_row(manager: JobManager, health_of: RigHealth, *, data: Path, started_at: datetime) -> dict[str, Any]:
+    """The columns of a rig's row except `seen_at` and `uncopied`. data : the service's folder."""
     status = manager.status()
     health, latest, _ = health_of.health()
-    state, words = _state(status)
+    state, text = _state(status)
     return {
         "name": status.rig,
         "origin": f"{platform.node()}:{data}",
@@ -637,7 +637,7 @@ def standing(manager: JobManager, health_of: RigHealth, *, data: Path, started_a
         "version": importlib.metadata.version("slrig"),
         "started_at": started_at,
         "state": state,
-        "words": words,
+        "words": text,
         "waiting": status.waiting,
         "computing": len(status.computing),
         "health": str(health.state),
@@ -647,7 +647,7 @@ def standing(manager: JobManager, health_of: RigHealth, *, data: Path, started_a
 
 
 def _state(status: RigStatus) -> tuple[str, str]:
-    """What a rig is at, and in words."""
+    """State of a rig, and its activity or fault as text."""
     if status.fault is not None:
         return "fault", status.fault
     if status.facts is None:

@@ -141,5 +141,5 @@ def test_a_killed_database_costs_no_scan_and_no_row(start: Start, tmp_path: Path
         states = server.execute("SELECT state FROM rig", "fleet")
         assert states == [["stopped"], ["stopped"]]
         logs = "".join(each.log.read_text() for each in services.values())
-        assert "the catalogue is not told of this rig" in logs
+        assert "this rig is not reported to the catalogue" in logs
         assert PASSWORD not in logs

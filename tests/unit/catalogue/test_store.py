@@ -364,8 +364,8 @@ def test_unreachable_catalogue_is_logged_and_holds_nothing_up(tmp_path: Path, mo
             copied = rig.copies.waiting()
         rig.copier.close()
     assert [each["event"] for each in logs] == [
-        "the catalogue is not told of this rig",
-        "the catalogue is told of this rig",
+        "this rig is not reported to the catalogue",
+        "this rig is reported to the catalogue",
     ]
     assert labels(catalogue) == ["one"]
     assert catalogue.fleet().rigs[0].state == "stopped"
