@@ -49,7 +49,7 @@ from slrig.model_jobs.turntable import TurntableStore
 from slrig.plugins import OBSERVERS, load, plugin_errors
 from slrig.scan.job import ScanJob
 from slrig.scan.plan import Presets
-from slrig.schedule.notices import NoticedHealth, Receivers, tell_run
+from slrig.schedule.notices import NoticedHealth, Receivers, notice_run
 from slrig.schedule.scheduler import ScanTask, Scheduler, Tasks
 from slrig.schedule.store import ScheduledRun, ScheduleStore
 
@@ -243,7 +243,7 @@ class Service:
             self.audit,
             clock,
         )
-        self.schedules = ScheduleStore(database, notice=partial(tell_run, outbox))
+        self.schedules = ScheduleStore(database, notice=partial(notice_run, outbox))
         scans = ScanTask(manager, self._usual_scan, self._require_healthy)
         self.tasks = Tasks(
             manager, self.calibrations, self.acceptance, scans, tidy=partial(self.retention.check, "calibration")

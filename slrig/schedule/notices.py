@@ -1,4 +1,4 @@
-"""Notices of what nobody would see until it is too late, such as failed runs and a rig that moved, and their receivers:
+"""Notices of events that would go unnoticed, such as failed runs and a rig that moved, and their receivers:
 the webhook, and those of plug-ins.
 """
 
@@ -34,22 +34,22 @@ from slrig.jobs.store import Notice, Outbox
 from slrig.plugins import RECEIVERS, load, plugin_errors
 from slrig.schedule.store import RunState, Schedule, ScheduledRun
 
-TOLD: dict[RunState, NoticeKind] = {
+NOTICE_KINDS: dict[RunState, NoticeKind] = {
     RunState(kind.removeprefix("run.")): kind for kind in get_args(NoticeKind) if kind.startswith("run.")
 }
-"""What becomes of a run that a person has to know of."""
+"""Kind of notice by the state of a run that a person has to know of."""
 
 
-def tell_run(outbox: Outbox, session: Session, schedule: Schedule, run: ScheduledRun) -> None:
-    """As `slrig.schedule.store.Notice`: tell of a run that a person has to know of."""
-    if run.state not in TOLD:
+def notice_run(outbox: Outbox, session: Session, schedule: Schedule, run: ScheduledRun) -> None:
+    """As `slrig.schedule.store.Notice`: queue a notice of a run that a person has to know of."""
+    if run.state not in NOTICE_KINDS:
         return
     due = schedule.order.cron.local(run.due)
     what = f"{schedule.order.task} due {due:%Y-%m-%d %H:%M %z}"
     more = "" if run.count == 1 else f", {run.count} times"
     outbox.put(
         session,
-        TOLD[run.state],
+        NOTICE_KINDS[run.state],
         f"{what} was {run.state}{more}: {run.reason or 'no reason is known'}",
         schedule={
             "id": str(schedule.id),
@@ -69,14 +69,14 @@ def tell_run(outbox: Outbox, session: Session, schedule: Schedule, run: Schedule
 
 
 class NoticedHealth(HealthStore):
-    """The history of a rig's health, every change of which is told."""
+    """The history of a rig's health, with a notice of every change."""
 
     def __init__(self, database: Database, outbox: Outbox) -> None:
         super().__init__(database)
         self._outbox = outbox
 
     def added(self, session: Session, before: VerificationRecord | None, now: VerificationRecord) -> None:
-        """Tell of a health that is another one than before. A first verification that finds all well is no news."""
+        """Queue a notice of a changed health. A first verification that finds all well needs none."""
         earlier = HealthState.UNKNOWN if before is None else before.health.state
         state = now.health.state
         if state is earlier or (before is None and state is HealthState.GOOD):
@@ -103,23 +103,23 @@ TIMEOUT_S = 15.0
 
 _END_S = 1.0
 _REFUSED_S = 5.0
-"""How long after the records refused they are looked at again."""
+"""Time until the records are read again after they refused."""
 
 _log = structlog.get_logger(__name__)
 
 
 _CAUSES = {
-    "ConnectError": "no connection: look at the address, and whether something listens there",
+    "ConnectError": "no connection: check the address, and whether something listens there",
     "ConnectionRefusedError": "no connection: nothing listens at that address and port",
     "gaierror": "there is no host of that name",
     **dict.fromkeys(("ConnectTimeout", "ReadError", "ReadTimeout", "TimeoutError"), "no answer in time"),
 }
-"""What the errors of a try mean, by their classes' names."""
+"""Meaning of the errors of a try, by their classes' names."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """How a test notice went. answer : of the receiver, or why there was none. sent : the notice."""
+    """Result of a test notice. answer : of the receiver, or why there was none. sent : the notice."""
 
     taken: bool
     answer: str
@@ -131,7 +131,7 @@ class Sender(ABC):
     """Sends notices on a thread of its own. Nothing waits for it, but `close`, for a second at most.
 
     A notice is sent again until its receiver takes it, and then forgotten. receiver : its name in the outbox. host :
-    what logs say of its address. answer : what the receiver answered last, in words.
+    its address, for logs. answer : the receiver's latest answer, as text.
     """
 
     receiver: ClassVar[str]
@@ -193,18 +193,18 @@ class Sender(ABC):
     def _sent(self, notice: Notice) -> str | None:
         try:
             return self.refusal(notice)
-        except BaseException as error:  # noqa: BLE001 - whatever it was, the next try may get through
+        except BaseException as error:  # noqa: BLE001 - after any error the next try may get through
             return type(error).__name__
 
     def _failed(self, notice: Notice, cause: str) -> float:
-        told = {"receiver": self.receiver, "host": self.host, "cause": cause}
-        told["notice"] = notice.body["words"]
+        facts = {"receiver": self.receiver, "host": self.host, "cause": cause}
+        facts["notice"] = notice.body["words"]
         if self._gone:
-            _log.error("the receiver is gone: nothing is sent before the next start of the service", **told)
+            _log.error("the receiver is gone: nothing is sent before the next start of the service", **facts)
             return LONGEST_WAIT_S
         wait_s = min(FIRST_WAIT_S * 2.0 ** min(self._failures, 30), LONGEST_WAIT_S)
         self._failures += 1
-        _log.warning("a notice was not delivered", tries=self._failures, again_in_s=wait_s, **told)
+        _log.warning("a notice was not delivered", tries=self._failures, again_in_s=wait_s, **facts)
         return wait_s
 
     def _send_all(self) -> None:
@@ -214,7 +214,7 @@ class Sender(ABC):
                 wait_s = self.step()
             except Exception as error:  # noqa: BLE001 - a full disk may be emptied; the notices wait
                 unexpected = not isinstance(error, StorageError)
-                _log.error("the notices could not be looked at", cause=str(error), exc_info=unexpected)
+                _log.error("the notices could not be read", cause=str(error), exc_info=unexpected)
                 wait_s = _REFUSED_S
             if wait_s is None and not self._ending.is_set():
                 self._news.wait()
@@ -228,7 +228,7 @@ _KEY_BYTES = range(24, 65)
 
 
 def signing_key(secret: str, source: str) -> bytes:
-    """The key that a secret stands for: Base64 of 24 to 64 bytes, with or without `whsec_` before it.
+    """The key of a secret: Base64 of 24 to 64 bytes, with or without `whsec_` before it.
 
     Raises ConfigError, which names the source and not the secret.
     """
@@ -246,7 +246,7 @@ def signing_key(secret: str, source: str) -> bytes:
 
 
 def signature(key: bytes, notice_id: str, timestamp: int, body: bytes) -> str:
-    """What the header `webhook-signature` says: HMAC-SHA256 over `id.timestamp.body`.
+    """The header `webhook-signature`: HMAC-SHA256 over `id.timestamp.body`.
 
     >>> signature(b"k" * 24, "msg_1", 1614265330, b"{}")
     'v1,KrbhoJST6Q+/bu1g6/FBBu+pIEtkrImj8aKkA5+3RXI='
@@ -332,7 +332,7 @@ class Receivers:
             try:
                 kept = read_json_model(self._path, WebhookEntry, "webhook", max_bytes=_MOST_BYTES, error=ConfigError)
             except ConfigError as error:
-                _log.error("the webhook is not told of anything: set it again", cause=str(error))
+                _log.error("the webhook gets no notices: set it again", cause=str(error))
             else:
                 self._use(kept)
 
@@ -350,9 +350,7 @@ class Receivers:
     def get(self, name: str) -> Sender:
         """A receiver. Raises ConfigError."""
         if name not in self.senders:
-            message = (
-                f"There is no receiver '{name}', but: {', '.join(self.senders) or 'none'}. GET /notices lists them."
-            )
+            message = f"There is no receiver '{name}'. GET /notices lists them: {', '.join(self.senders) or 'none'}."
             raise ConfigError(message)
         return self.senders[name]
 

@@ -45,25 +45,25 @@ from slrig.jobs.store import JobStore
 from slrig.rig.session import RigFacts
 from slrig.schedule.store import RunState, Schedule, ScheduledRun, ScheduleSpec, ScheduleStore, TaskKind
 
-LOOK_S = 10.0
-"""The clock is looked at this often at the least, so that one that is set anew is noticed."""
+CHECK_S = 10.0
+"""Longest interval between checks of the clock, so that a change of it is noticed."""
 
 _LEAST_WAIT_S = 0.05
-"""Between two looks, so that a run that cannot be started yet does not keep a core busy."""
+"""Between two checks, so that a run that cannot be started yet does not keep a core busy."""
 
 _log = structlog.get_logger(__name__)
 
 
 Work = Callable[[Schedule, ScheduledRun], Mapping[str, Any]]
-"""Does what a schedule asks for, on a thread of the scheduler's. Returns what is on record of it.
+"""Does the work of a schedule, on a thread of the scheduler's. Returns the result for its record.
 
-Raises RigBusyError where somebody holds the rig, before anything was done; SlrigError where it could not be done: what
-may pass, see `passes`, has the run try again within its grace.
+Raises RigBusyError where the rig is held, before anything was done; SlrigError where it could not be done: after a
+passing error, see `passes`, the run tries again within its grace.
 """
 
 
 def passes(error: SlrigError) -> bool:
-    """Whether a run that met this may go well a little later: the rig was held, a device failed, the worker was lost.
+    """Whether a run with this error may succeed a little later: the rig was held, a device failed, the worker was lost.
 
     >>> passes(DeviceError("no answer")), passes(UnsupportedByDeviceError("no such trigger"))
     (True, False)
@@ -102,15 +102,15 @@ class Scheduler:
         self._stop = threading.Event()
         self._idle = threading.Event()
         self._idle.set()
-        self._loop = LastingThread(self._look_again, "slrig-schedule")
+        self._loop = LastingThread(self._run, "slrig-schedule")
 
     def start(self) -> None:
-        """Record what a process before this one left behind, and look at the clock from now on."""
-        _log_runs(self._store.interrupt_dead(self._clock(), alone=self._alone))
+        """Close the runs of earlier processes, and check the clock from now on."""
+        _log_runs(self._store.interrupt_lost(self._clock(), alone=self._alone))
         self._loop.start()
 
     def wake(self) -> None:
-        """Look at the clock now: a schedule was changed, or the rig became free."""
+        """Check the clock now: a schedule was changed, or the rig became free."""
         self._wanted.set()
 
     def stop(self) -> None:
@@ -126,12 +126,12 @@ class Scheduler:
         self._idle.wait(timeout_s)
 
     def tick(self) -> datetime:
-        """Look at the clock once. Returns when to look again."""
+        """Check the clock once. Returns the time of the next check."""
         now, store = self._clock(), self._store
         if self._idle.is_set():
             _log_runs(store.interrupt_own(now))
         store.beat(now)
-        _log_runs(store.interrupt_dead(now))
+        _log_runs(store.interrupt_lost(now))
         _log_runs(run for run in store.record_due(now) if run.state.final)
         _log_runs(store.expire(now))
         for run in store.startable(now):
@@ -139,8 +139,8 @@ class Scheduler:
                 break
             if store.start(run, now):
                 self._begin(run)
-        look = now + timedelta(seconds=LOOK_S)
-        return min(store.next_moment() or look, look)
+        check = now + timedelta(seconds=CHECK_S)
+        return min(store.next_moment() or check, check)
 
     def _begin(self, run: ScheduledRun) -> None:
         schedule = self._store.get(run.schedule)
@@ -151,7 +151,7 @@ class Scheduler:
                 with acting_as(f"schedule {schedule.id}"):
                     self._end(schedule, run)
             except SlrigError:
-                # A full disk: the next look takes down that it is over.
+                # A full disk: the next check records its end.
                 _log.exception("the end of a scheduled run could not be put on record", schedule=str(schedule.id))
             finally:
                 self._idle.set()
@@ -174,7 +174,7 @@ class Scheduler:
                 self._store.postpone(run, reason, again)
                 return
             state = RunState.SKIPPED if busy else RunState.FAILED
-        except Exception as error:  # noqa: BLE001 - the schedule outlives whatever happens in one run
+        except Exception as error:  # noqa: BLE001 - the schedule outlives any error of one run
             _log.exception("a scheduled run failed", schedule=str(schedule.id), due=run.due.isoformat())
             reason = f"an error of its own: {error!r}"
         if (self._stop.is_set() or cut_off) and state is not RunState.SUCCEEDED:
@@ -184,17 +184,17 @@ class Scheduler:
         with suppress(ScheduleNotFoundError):
             _log_runs(each for each in self._store.runs(schedule.id) if each.number == run.number)
 
-    def _look_again(self) -> None:
+    def _run(self) -> None:
         while not self._stop.is_set():
-            # Before the look: what is wanted while it lasts is looked at once more.
+            # Before the check: a request during it causes another one.
             self._wanted.clear()
             try:
                 wait_s = (self.tick() - self._clock()).total_seconds()
             except Exception:  # noqa: BLE001 - a full disk may be emptied; the schedule goes on
-                _log.exception("the schedule could not be looked at")
-                wait_s = LOOK_S
+                _log.exception("the schedule could not be checked")
+                wait_s = CHECK_S
             if not self._stop.is_set():
-                self._wanted.wait(min(max(wait_s, _LEAST_WAIT_S), LOOK_S))
+                self._wanted.wait(min(max(wait_s, _LEAST_WAIT_S), CHECK_S))
 
 
 def _log_runs(runs: Iterable[ScheduledRun]) -> None:
@@ -232,7 +232,7 @@ class ScheduledBoard(Strict):
 
 
 class VerificationOptions(Strict):
-    """Of a verification. board None : that of the calibration in use. position None : the board stays where it is."""
+    """Options of a verification. board None : that of the calibration in use. position None : the board stays there."""
 
     board: ScheduledBoard | None = None
     position: Position | None = None
@@ -240,14 +240,14 @@ class VerificationOptions(Strict):
 
 
 class ScanOptions(Strict):
-    """Of a scan. preset None : as the rig is set."""
+    """Options of a scan. preset None : as the rig is set."""
 
     preset: PresetName | None = None
     label: FreeText | None = None
 
 
 class CalibrationOptions(Strict):
-    """Of a full set of poses with its solve. positions none : all of them. activate : have scans use what came of it,
+    """Options of a full set of poses with its solve. positions none : all of them. activate : use the result for scans,
     unless its verdict leaves that to a person.
     """
 
@@ -276,10 +276,10 @@ def checked(model: type[Options], given: Mapping[str, Any], *, task: str) -> Opt
         raise ScheduleError(message) from error
 
 
-def require_positions(facts: RigFacts | None, asked: Sequence[int | str]) -> None:
+def require_positions(facts: RigFacts | None, positions: Sequence[int | str]) -> None:
     """Refuse work that needs a positioner where the rig has none, or not those positions.
 
-    facts None : the rig is not open, and nobody knows; a run is refused then. asked : by number from 0 or by name.
+    facts None : the rig is not open, all is possible; a run is refused then. positions : by number from 0 or by name.
 
     Raises
     ------
@@ -291,12 +291,12 @@ def require_positions(facts: RigFacts | None, asked: Sequence[int | str]) -> Non
     names = facts.positions
     if not names:
         message = (
-            "this rig has no positioner, and nobody is there to move anything when a schedule is due: schedule a "
-            "verification of a board that stays in view, and calibrate or test by hand (slrig calibrate run, slrig "
+            "this rig has no positioner, and a schedule cannot rely on a person to move anything: schedule a "
+            "verification of a board that stays in view, and calibrate or test manually (slrig calibrate run, slrig "
             "accept)"
         )
         raise ScheduleError(message)
-    missing = [each for each in asked if each not in names and each not in range(len(names))]
+    missing = [each for each in positions if each not in names and each not in range(len(names))]
     if missing:
         message = (
             f"options: this rig's positioner has no {', '.join(map(repr, missing))}; it has 0 to {len(names) - 1}: "
@@ -305,19 +305,19 @@ def require_positions(facts: RigFacts | None, asked: Sequence[int | str]) -> Non
         raise ScheduleError(message)
 
 
-_TOLD = ("state", "reasons", "remedy", "expected_mm", "drift_mm", "scale_percent", "scale_mm")
+_SUMMARY = ("state", "reasons", "remedy", "expected_mm", "drift_mm", "scale_percent", "scale_mm")
 
 
 class Stop:
-    """Has a run of a schedule end early. Any thread may call."""
+    """Ends a run of a schedule early. Any thread may call."""
 
     def __init__(self) -> None:
         self._news = threading.Event()
-        self._asked = False
+        self._requested = False
 
-    def ask(self) -> None:
-        """Have the run end."""
-        self._asked = True
+    def request(self) -> None:
+        """Request the end of the run."""
+        self._requested = True
         self._news.set()
 
     def wait(
@@ -329,7 +329,7 @@ class Stop:
         unwatch = jobs.watch(followed, self._news.set)
         try:
             while not reached():
-                if self._asked:
+                if self._requested:
                     cancel()
                     message = "the run was cancelled"
                     raise ScanCancelledError(message)
@@ -361,18 +361,18 @@ class ScanTask:
         self._job = job
         self._require_healthy = require_healthy
 
-    def check(self, asked: ScanOptions, /) -> None:
+    def check(self, options: ScanOptions, /) -> None:
         """See `Task`."""
         try:
-            self._job(asked.preset)
+            self._job(options.preset)
         except PresetNotFoundError as error:
             message = f"options: {error}"
             raise ScheduleError(message) from error
 
-    def do(self, holder: Holder, asked: ScanOptions, /, *, stop: Stop) -> Mapping[str, Any]:
+    def do(self, holder: Holder, options: ScanOptions, /, *, stop: Stop) -> Mapping[str, Any]:
         """See `Task`."""
         self._require_healthy()
-        scan = done(self._manager, self._job(asked.preset), holder, stop, label=asked.label)
+        scan = done(self._manager, self._job(options.preset), holder, stop, label=options.label)
         return {"scan": str(scan.id), "points": ((scan.summary or {}).get("mesh") or {}).get("points")}
 
 
@@ -385,22 +385,22 @@ class VerificationTask:
         self._manager = manager
         self._calibrations = calibrations
 
-    def check(self, asked: VerificationOptions, /) -> None:
-        """See `Task`. A calibration may be made before the first run; a board to look at is named now or never."""
-        self._board(asked)
-        if asked.position is not None:
-            require_positions(self._manager.rig.facts, [asked.position])
+    def check(self, options: VerificationOptions, /) -> None:
+        """See `Task`. A calibration may be made before the first run; a board to verify with is named now or never."""
+        self._board(options)
+        if options.position is not None:
+            require_positions(self._manager.rig.facts, [options.position])
 
-    def do(self, holder: Holder, asked: VerificationOptions, /, *, stop: Stop) -> Mapping[str, Any]:
+    def do(self, holder: Holder, options: VerificationOptions, /, *, stop: Stop) -> Mapping[str, Any]:
         """See `Task`. A rig that is found stale is a verification that succeeded."""
-        job = VerificationJob(self._board(asked), asked.position, asked.exposure_s)
+        job = VerificationJob(self._board(options), options.position, options.exposure_s)
         found = done(self._manager, job, holder, stop).summary or {}
-        return {"verification": found["id"], **{name: found.get(name) for name in _TOLD}}
+        return {"verification": found["id"], **{name: found.get(name) for name in _SUMMARY}}
 
-    def _board(self, asked: VerificationOptions) -> Board:
-        """The board that is asked for, or that of the calibration in use."""
-        if asked.board is not None:
-            return asked.board.board()
+    def _board(self, options: VerificationOptions) -> Board:
+        """The requested board, or that of the calibration in use."""
+        if options.board is not None:
+            return options.board.board()
         active = self._calibrations.active
         board = None if active is None else self._calibrations.register.get(active).board
         if board is None:
@@ -415,7 +415,7 @@ class VerificationTask:
 
 
 class CalibrationTask:
-    """Every pose of the positioner shot, the solve, and, if asked for, its use. Scans may come between two poses; a
+    """Every pose of the positioner shot, the solve, and, if requested, its use. Scans may come between two poses; a
     pose waits in line behind them.
 
     tidy : called after each, however it ended, so that they do not pile up.
@@ -428,30 +428,30 @@ class CalibrationTask:
         self._calibrations = calibrations
         self._tidy = tidy
 
-    def check(self, asked: CalibrationOptions, /) -> None:
+    def check(self, options: CalibrationOptions, /) -> None:
         """See `Task`."""
-        asked.board.board()
-        require_positions(self._manager.rig.facts, asked.positions)
+        options.board.board()
+        require_positions(self._manager.rig.facts, options.positions)
 
-    def do(self, holder: Holder, asked: CalibrationOptions, /, *, stop: Stop) -> Mapping[str, Any]:
+    def do(self, holder: Holder, options: CalibrationOptions, /, *, stop: Stop) -> Mapping[str, Any]:
         """See `Task`. Poses that are refused are left out; one that fails ends the run."""
         facts = self._manager.rig.facts
-        require_positions(facts, asked.positions)
-        first, *others = asked.positions or range(0 if facts is None else len(facts.positions))
-        session = self._calibrations.open(asked.board.board(), label=holder.label).id
+        require_positions(facts, options.positions)
+        first, *others = options.positions or range(0 if facts is None else len(facts.positions))
+        session = self._calibrations.open(options.board.board(), label=holder.label).id
         try:
             try:
-                # The first may not wait: a busy rig is told before anything was done.
-                self._shoot(session, holder, PoseRequest(first, asked.exposure_s), wait=False)
+                # The first may not wait: a busy rig is reported before anything was done.
+                self._shoot(session, holder, PoseRequest(first, options.exposure_s), wait=False)
             except BaseException:
                 self._calibrations.delete(session)
                 raise
             for position in others:
                 # Until the last pose was shot: it may still be read while the next one is.
                 self._await_poses(session, {JobState.QUEUED, JobState.CAPTURING}, stop)
-                self._shoot(session, holder, PoseRequest(position, asked.exposure_s), wait=True)
+                self._shoot(session, holder, PoseRequest(position, options.exposure_s), wait=True)
             self._await_poses(session, {JobState.QUEUED, JobState.CAPTURING, JobState.COMPUTING}, stop)
-            return self._solved(session, asked, stop)
+            return self._solved(session, options, stop)
         except (DeviceError, WorkerLostError):
             # It is tried again from the first pose on. A pose that is being read yet leaves it to `tidy`.
             with suppress(CalibrationStateError, CalibrationNotFoundError):
@@ -478,7 +478,7 @@ class CalibrationTask:
             if pose.fault is not None and not pose.refused:
                 raise error_of(pose.fault)
 
-    def _solved(self, session: UUID, asked: CalibrationOptions, stop: Stop) -> Mapping[str, Any]:
+    def _solved(self, session: UUID, options: CalibrationOptions, stop: Stop) -> Mapping[str, Any]:
         register = self._calibrations.register
         self._calibrations.solve(session)
 
@@ -491,9 +491,9 @@ class CalibrationTask:
             raise error_of(record.fault)
         result = record.result or {}
         verdict = result.get("verdict") or {}
-        # Nobody looks at the report before scans use it.
+        # No person checks the report before scans use it.
         unattended = verdict.get("unattended") or []
-        activated = asked.activate and not unattended
+        activated = options.activate and not unattended
         if activated:
             self._calibrations.activate(session)
         return {
@@ -508,7 +508,7 @@ class CalibrationTask:
             "verdict": verdict.get("summary"),
             "expected_error_mm": (result.get("expected") or {}).get("point_mm"),
             "activated": activated,
-            "left_to_a_person": unattended if asked.activate else [],
+            "left_to_a_person": unattended if options.activate else [],
         }
 
 
@@ -521,14 +521,14 @@ class AcceptanceTask:
         self._manager = manager
         self._tests = tests
 
-    def check(self, _asked: AcceptanceRequest, /) -> None:
+    def check(self, _options: AcceptanceRequest, /) -> None:
         """See `Task`."""
         require_positions(self._manager.rig.facts, ())
 
-    def do(self, holder: Holder, asked: AcceptanceRequest, /, *, stop: Stop) -> Mapping[str, Any]:
+    def do(self, holder: Holder, options: AcceptanceRequest, /, *, stop: Stop) -> Mapping[str, Any]:
         """See `Task`. A rig that fails the test is a run that succeeded."""
         tests = self._tests
-        test = tests.open(asked.plan).id
+        test = tests.open(options.plan).id
         try:
             tests.measure(test, wait=False, scripted=True, holder=holder)
         except BaseException:
@@ -565,17 +565,17 @@ class ScheduledTask(Protocol):
     @property
     def options(self) -> type[Strict]: ...  # noqa: D102 - see above
 
-    def check(self, asked: Any, /) -> None:
+    def check(self, options: Any, /) -> None:
         """Raise ScheduleError or CalibrationError for options that no run could be done with, as far as is known."""
         ...
 
-    def do(self, holder: Holder, asked: Any, /, *, stop: Stop) -> Mapping[str, Any]:
+    def do(self, holder: Holder, options: Any, /, *, stop: Stop) -> Mapping[str, Any]:
         """Do it, the rig held by `holder`, and return what is on record of it, as JSON values.
 
         Raises
         ------
         RigBusyError
-            Somebody holds the rig: before anything was done.
+            The rig is held: before anything was done.
         SlrigError
             It could not be done.
         """
@@ -624,7 +624,7 @@ class Tasks:
         with self._lock:
             self._stops[schedule.id] = stop
             if self._ended:
-                stop.ask()
+                stop.request()
         try:
             if self._manager.rig.facts is None:
                 # What it can do is known only when it is open.
@@ -635,25 +635,25 @@ class Tasks:
                 self._stops.pop(schedule.id, None)
 
     def end(self) -> None:
-        """Have every run end: the service ends."""
+        """Request the end of every run: the service ends."""
         with self._lock:
             self._ended = True
             stops = list(self._stops.values())
         for stop in stops:
-            stop.ask()
+            stop.request()
 
     def cancel(self, schedule: Schedule) -> None:
-        """Ask the run of a schedule that is under way to end early. Returns at once. Raises ScanStateError."""
+        """Request the early end of a schedule's run under way. Returns at once. Raises ScanStateError."""
         with self._lock:
             stop = self._stops.get(schedule.id)
         if stop is None:
             message = f"Schedule {schedule.id} has no run under way. GET /schedule/{schedule.id}/runs lists its runs."
             raise ScanStateError(message)
-        stop.ask()
+        stop.request()
 
 
 def holder_of(schedule: Schedule, run: ScheduledRun) -> Holder:
-    """Who holds the rig for a run.
+    """The holder of the rig for a run.
 
     >>> from datetime import UTC, datetime
     >>> from slrig.schedule.store import Cron, RunState, ScheduleSpec
@@ -665,5 +665,5 @@ def holder_of(schedule: Schedule, run: ScheduledRun) -> Holder:
     'schedule 00000000, verification due 06:30'
     """
     due = schedule.order.cron.local(run.due)
-    words = f"schedule {str(schedule.id)[:8]}, {schedule.order.task} due {due:%H:%M}"
-    return Holder(words, words, f"/schedule/{schedule.id}")
+    label = f"schedule {str(schedule.id)[:8]}, {schedule.order.task} due {due:%H:%M}"
+    return Holder(label, label, f"/schedule/{schedule.id}")

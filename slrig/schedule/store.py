@@ -1,8 +1,8 @@
 """Schedules and their runs: when they are due, and their records in the service's database.
 
 Two processes may read one database: a due time has one row, which the first to see it makes, and a run is started by
-the one that changes its row from waiting to running. A run that is under way keeps its row fresh (`beat`); one whose
-process died does not, and is recorded as interrupted.
+the one that changes its row from waiting to running. A run that is under way keeps its row fresh (`beat`); the run of a
+lost process does not, and is recorded as interrupted.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Cron:
     Raises
     ------
     ScheduleError
-        The text is no cron expression, it never comes, or there is no such time zone.
+        The text is not a cron expression, it never comes, or there is no such time zone.
     """
 
     text: str
@@ -93,7 +93,7 @@ class Cron:
             reach *= 8
 
     def count(self, first: datetime, last: datetime, *, most: int) -> int:
-        """How many due times lie from `first` to `last`, both included; `most` stands for that many or more."""
+        """Number of due times from `first` to `last`, both included; `most` means that many or more."""
         return sum(1 for _ in islice(self._from(first, last), most))
 
     def _from(self, first: datetime, last: datetime) -> Iterator[datetime]:
@@ -109,9 +109,9 @@ class Cron:
 
 
 class TaskKind(StrEnum):
-    """What a schedule does with the rig.
+    """The work of a schedule.
 
-    VERIFICATION looks whether the calibration still holds; CALIBRATION shoots every pose of a positioner and solves;
+    VERIFICATION checks whether the calibration still holds; CALIBRATION shoots every pose of a positioner and solves;
     ACCEPTANCE measures the prescribed artefacts; SCAN scans once.
     """
 
@@ -123,12 +123,12 @@ class TaskKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ScheduleSpec:
-    """What a person asks for: when, what, and how late it may be.
+    """The request of a person: when, what, and how late it may be.
 
     grace_s : how long after its time a run may still start, a busy rig's included. retry_s : a run that finds the rig
     busy, or a device that fails, tries again so often. catch_up : after a pause longer than the grace (the service was
     off, the schedule was paused) the newest of the runs that were missed is made up for, once; otherwise it is recorded
-    as missed. options : of the task, checked by whoever does it.
+    as missed. options : of the task, which checks them.
 
     Raises
     ------
@@ -158,7 +158,7 @@ class ScheduleSpec:
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """An order on record. `next_due` is the time that no run has been recorded for yet."""
+    """An order on record. `next_due` is the first time without a recorded run."""
 
     id: UUID
     order: ScheduleSpec
@@ -167,11 +167,12 @@ class Schedule:
 
 
 class RunState(StrEnum):
-    """What became of a due time.
+    """The state of a due time.
 
     WAITING for the rig, and RUNNING, are under way. SUCCEEDED and FAILED ran. SKIPPED found the rig busy, or the
-    schedule in the way of itself, for the whole of its grace. MISSED was due while nobody was there, and is not made up
-    for; COALESCED stands for older ones whose place the newest took. INTERRUPTED was cut off in the middle.
+    schedule's earlier run under way, for the whole of its grace. MISSED was due while the service was off or the
+    schedule paused, and is not made up for; COALESCED represents older ones, replaced by the newest. INTERRUPTED was
+    cut off in the middle.
     """
 
     WAITING = "waiting"
@@ -191,11 +192,10 @@ class RunState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ScheduledRun:
-    """One due time of one schedule, and what became of it.
+    """One due time of one schedule, and its outcome.
 
-    count : how many due times the row stands for, 1 but for missed and coalesced ones. deadline : the latest start.
-    attempts : how often the rig was asked for. reason : in words, where the run did not simply succeed.
-    result : what the task tells.
+    count : number of due times of the row, 1 except for missed and coalesced ones. deadline : the latest start.
+    attempts : number of starts. reason : for people, where the run did not simply succeed. result : of the task.
     """
 
     number: int
@@ -218,7 +218,7 @@ MOST_COUNTED = 10_000
 
 @dataclass(frozen=True, slots=True)
 class DueRun:
-    """A row to be made: one due time that runs, or one that stands for `count` that do not."""
+    """A row to be made: one due time that runs, or one for `count` that do not."""
 
     due: datetime
     state: RunState
@@ -229,14 +229,14 @@ class DueRun:
 
 @dataclass(frozen=True, slots=True)
 class Due:
-    """What one look at the clock gives: rows, old to new, and the due time to look out for next."""
+    """Result of one check of the clock: rows, old to new, and the next due time."""
 
     runs: tuple[DueRun, ...]
     next_due: datetime
 
 
 def due_runs(order: ScheduleSpec, next_due: datetime, now: datetime) -> Due:
-    """What became due since, and what is to be done about it.
+    """The due times since, and their rows.
 
     One due time within its grace runs. After a pause the newest is the one that counts: it runs if it is still within
     its grace, or once, late, if the order makes up for missed runs; the older ones are recorded in one row. A clock
@@ -257,12 +257,12 @@ def due_runs(order: ScheduleSpec, next_due: datetime, now: datetime) -> Due:
     if older > 0:
         rows.append(_older(next_due, newest, older, coalesced=runs))
     if not runs:
-        reason = f"nobody was there from {_clock(order, newest)} until {_clock(order, now)}, longer than the grace"
+        reason = f"the schedule was off from {_clock(order, newest)} to {_clock(order, now)}, longer than the grace"
         rows.append(DueRun(newest, RunState.MISSED, reason, 1, newest + grace))
     elif in_time:
         rows.append(DueRun(newest, RunState.WAITING, None, 1, newest + grace))
     else:
-        reason = f"made up for: due at {_clock(order, newest)}, nobody was there until {_clock(order, now)}"
+        reason = f"made up for: due at {_clock(order, newest)}, the schedule was off until {_clock(order, now)}"
         rows.append(DueRun(newest, RunState.WAITING, reason, 1, now + grace))
     return Due(tuple(rows), following)
 
@@ -272,7 +272,7 @@ def _older(first: datetime, newest: datetime, count: int, *, coalesced: bool) ->
     if count >= MOST_COUNTED - 1:
         times = f"{count} due times or more"
     if coalesced:
-        return DueRun(first, RunState.COALESCED, f"{times} passed unattended; the newest stands for all", count, newest)
+        return DueRun(first, RunState.COALESCED, f"{times} passed unattended; only the newest runs", count, newest)
     return DueRun(first, RunState.MISSED, f"{times} passed unattended", count, newest)
 
 
@@ -281,7 +281,7 @@ def _clock(order: ScheduleSpec, moment: datetime) -> str:
 
 
 LIFE_S = 60.0
-"""How long a run counts as alive after its process last said so."""
+"""Validity of the heartbeat of a run's process."""
 
 _KEPT_RUNS = 5000
 _PENDING = tuple(str(state) for state in RunState if not state.final)
@@ -293,7 +293,7 @@ _run_adapter = TypeAdapter(ScheduledRun)
 
 
 Notice = Callable[[Session, Schedule, ScheduledRun], None]
-"""Told of every run that came to an end, or never began, in the transaction that records it."""
+"""Called with every run that came to an end, or never began, in the transaction that records it."""
 
 
 class ScheduleStore:
@@ -330,7 +330,7 @@ class ScheduleStore:
             return list(readable(session.scalars(query), _schedule))
 
     def enable(self, schedule_id: UUID, *, enabled: bool) -> Schedule:
-        """Pause a schedule, or let it go on. What was due during the pause is then judged as after any other.
+        """Pause or resume a schedule. Due times of the pause are then treated as after any other.
 
         Raises ScheduleNotFoundError.
         """
@@ -345,7 +345,7 @@ class ScheduleStore:
             session.delete(_found(session, schedule_id))
 
     def runs(self, schedule_id: UUID, *, before: int | None = None, limit: int = 50) -> Sequence[ScheduledRun]:
-        """Up to `limit` runs of a schedule, newest first, whose number is below `before`."""
+        """Up to `limit` runs of a schedule, newest first, with numbers below `before`."""
         with self.database.reading() as session:
             _found(session, schedule_id)
             query = select(RunRow).where(RunRow.schedule_id == str(schedule_id))
@@ -355,7 +355,7 @@ class ScheduleStore:
             return list(islice(readable(rows, _run), limit))
 
     def counts(self) -> dict[tuple[TaskKind, RunState], int]:
-        """How many runs of each task are on record in each state. A row that stands for several counts as those."""
+        """Number of recorded runs of each task in each state. A row of several counts as those."""
         query = (
             select(ScheduleRow.task, RunRow.state, func.sum(RunRow.count))
             .join(RunRow, RunRow.schedule_id == ScheduleRow.id)
@@ -386,7 +386,7 @@ class ScheduleStore:
             return [_run(each) for each in made]
 
     def run_now(self, schedule_id: UUID, now: datetime) -> ScheduledRun:
-        """Record a run that is due at this moment, whatever the order's times are, and though it may be paused.
+        """Record a run that is due at this moment, outside of the order's times, also while it is paused.
 
         Raises ScheduleNotFoundError; ScanStateError: one of its runs is under way, or waits for the rig.
         """
@@ -400,7 +400,7 @@ class ScheduleStore:
                 )
                 raise ScanStateError(message)
             deadline = now + timedelta(seconds=schedule.grace_s)
-            due = DueRun(now, RunState.WAITING, "asked for by a person, not by the clock", 1, deadline)
+            due = DueRun(now, RunState.WAITING, "requested by a person, not by the clock", 1, deadline)
             made = self._recorded(session, schedule, due, now)
             _prune(session, schedule.id)
             return _run(made[0])
@@ -424,7 +424,7 @@ class ScheduleStore:
         return min([*due, *([] if again is None else [again])], default=None)
 
     def start(self, run: ScheduledRun, now: datetime) -> bool:
-        """Take a waiting run; False if somebody else has it, or another run is under way."""
+        """Take a waiting run; False if another process has it, or another run is under way."""
         with self.database.changing() as session:
             row = session.get(RunRow, run.number)
             under_way = session.scalar(select(RunRow.number).where(RunRow.state == RunState.RUNNING).limit(1))
@@ -451,29 +451,29 @@ class ScheduleStore:
         reason: str | None,
         result: Mapping[str, Any] | None = None,
     ) -> None:
-        """Record what became of a run. The first final state stands."""
+        """Record the end of a run. Only the first final state counts."""
         with self.database.changing() as session:
             row = session.get(RunRow, run.number)
             if row is not None and not RunState(row.state).final:
                 _close(row, state, now, reason)
                 row.result = None if result is None else dict(result)
-                self._tell(session, row)
+                self._report(session, row)
 
     def beat(self, now: datetime) -> None:
-        """Say that this process is alive, and with it the run that it has under way."""
+        """Record a heartbeat of this process, and of its run under way."""
         with self.database.changing() as session:
             query = select(RunRow).where(RunRow.state == RunState.RUNNING, RunRow.owner == self._owner)
             for row in session.scalars(query):
                 row.alive_until = stamp(now + timedelta(seconds=LIFE_S))
 
-    def interrupt_dead(self, now: datetime, *, alone: bool = False) -> Sequence[ScheduledRun]:
-        """Record runs whose process died as interrupted: those that did not say for long that they are alive.
+    def interrupt_lost(self, now: datetime, *, alone: bool = False) -> Sequence[ScheduledRun]:
+        """Record the runs of lost processes as interrupted: those without a recent heartbeat.
 
-        alone : no other process uses the database, so that every run of another one is dead.
+        alone : no other process uses the database, so that every run of another one is lost.
         """
         query = select(RunRow).where(RunRow.state == RunState.RUNNING, RunRow.owner != self._owner)
         if not alone:
-            # The second test is for a clock that was set back: nobody says that far ahead that he is alive.
+            # The second test is for a clock that was set back: no heartbeat is that far ahead.
             query = query.where(
                 (RunRow.alive_until < stamp(now)) | (RunRow.alive_until > stamp(now + timedelta(seconds=2 * LIFE_S)))
             )
@@ -487,7 +487,7 @@ class ScheduleStore:
         return self._closed(query, RunState.INTERRUPTED, now, lambda _: "it ended, and how could not be put on record")
 
     def expire(self, now: datetime) -> Sequence[ScheduledRun]:
-        """Record runs that waited for the whole of their grace as skipped, each with what it waited for."""
+        """Record runs that waited for the whole of their grace as skipped, each with the reason of its wait."""
         query = select(RunRow).where(RunRow.state == RunState.WAITING, RunRow.deadline < stamp(now))
 
         def reason(row: RunRow) -> str:
@@ -503,12 +503,12 @@ class ScheduleStore:
 
             def close(row: RunRow) -> ScheduledRun:
                 _close(row, state, now, reason(row))
-                self._tell(session, row)
+                self._report(session, row)
                 return _run(row)
 
             return list(readable(list(session.scalars(query)), close))
 
-    def _tell(self, session: Session, row: RunRow) -> None:
+    def _report(self, session: Session, row: RunRow) -> None:
         self._notice(session, _schedule(_found(session, UUID(row.schedule_id))), _run(row))
 
     def _recorded(self, session: Session, schedule: ScheduleRow, due: DueRun, now: datetime) -> list[RunRow]:
@@ -532,7 +532,7 @@ class ScheduleStore:
         session.add(row)
         session.flush()
         if due.state.final:
-            self._tell(session, row)
+            self._report(session, row)
         return [row]
 
     def _row(self, session: Session, schedule_id: str, due: datetime) -> RunRow | None:

@@ -164,7 +164,7 @@ def test_paused_schedule_runs_on_request(client: TestClient, served: ServedBench
     assert begun.status_code == 202, begun.text
     first = begun.json()
     assert (first["state"], first["reason"], first["count"]) == (
-        "waiting", "asked for by a person, not by the clock", 1
+        "waiting", "requested by a person, not by the clock", 1
     )  # fmt: skip
     deadline_s = time.monotonic() + WAIT_S
     while (found := client.get(made["links"]["runs"]).json()["runs"])[0]["state"] != "failed":
@@ -257,7 +257,7 @@ def test_command_pauses_resumes_cancels_and_removes(
     # As a run under way leaves it there.
     monkeypatch.setitem(served.service.tasks._stops, UUID(made["id"]), stop)
     assert done("cancel", beginning) == "the run was asked to end\n"
-    assert stop._asked
+    assert stop._requested
     assert kept(client) == [made]
     assert f"there are: {beginning}" in refused(run("pause", "zzz"))
     assert done("remove", beginning) == "removed\n"

@@ -29,7 +29,7 @@ from slrig.errors import (
     WorkerLostError,
 )
 from slrig.jobs.database import Database
-from slrig.schedule.scheduler import LOOK_S, Scheduler
+from slrig.schedule.scheduler import CHECK_S, Scheduler
 from slrig.schedule.store import Cron, RunState, Schedule, ScheduledRun, ScheduleSpec, ScheduleStore, TaskKind
 from tests.samples import put_database
 from tests.unit.jobs.tame_manager import PowerCut
@@ -202,13 +202,13 @@ def test_run_on_time(desk: Desk) -> None:
         # Within its grace a late run says nothing of it.
         ({}, 1.9, [("23 06:00", RunState.SUCCEEDED, 1)], "None"),
         ({}, 4, [("23 06:00", RunState.SUCCEEDED, 1)], "made up for"),
-        ({"catch_up": False}, 4, [("23 06:00", RunState.MISSED, 1)], "nobody was there"),
+        ({"catch_up": False}, 4, [("23 06:00", RunState.MISSED, 1)], "the schedule was off"),
         ({}, 14 * 24, [("23 06:00", RunState.COALESCED, 13), ("06 06:00", RunState.SUCCEEDED, 1)], "made up for"),
         (
             {"catch_up": False},
             14 * 24,
             [("23 06:00", RunState.MISSED, 13), ("06 06:00", RunState.MISSED, 1)],
-            "nobody was there",
+            "the schedule was off",
         ),
         # Three years of minutes: counted up to a limit.
         (
@@ -248,7 +248,7 @@ def test_run_that_a_person_asks_for_waits_as_others_do_and_has_no_twin(desk: Des
     assert desk.store.get(daily.id).next_due == daily.next_due
     desk.store.run_now(daily.id, desk.now)
     desk.look(seconds=1)
-    assert (len(desk.done), desk.run(daily).reason) == (2, "asked for by a person, not by the clock")
+    assert (len(desk.done), desk.run(daily).reason) == (2, "requested by a person, not by the clock")
     with pytest.raises(ScheduleNotFoundError):
         desk.store.run_now(UUID(int=1), desk.now)
 
@@ -436,10 +436,10 @@ def test_loop_ends_what_was_left_and_waits_for_the_next_due_time(new_desk: NewDe
     other = new_desk(now=one.now)
     wanted = other.scheduler._wanted = Wanted()
     other.scheduler.start()
-    assert wanted.waits.get(timeout=WAIT_S) == LOOK_S
+    assert wanted.waits.get(timeout=WAIT_S) == CHECK_S
     assert other.rows(daily) == [("23 06:00", RunState.INTERRUPTED, 1)]
     assert other.told == [(START + timedelta(hours=1), RunState.INTERRUPTED)]
-    for seconds, wait_s in ((24 * 3600 - 4, 4.0), (4, LOOK_S)):
+    for seconds, wait_s in ((24 * 3600 - 4, 4.0), (4, CHECK_S)):
         other.now += timedelta(seconds=seconds)
         other.scheduler.wake()
         assert wanted.waits.get(timeout=WAIT_S) == wait_s
@@ -476,7 +476,7 @@ def test_cut_at_any_change_leaves_one_row_for_each_due_time_and_begins_no_run_tw
         desk = new_desk(now=desk.now)
         cut = Cut(desk.store.database, number, kept=kept)
         try:
-            desk.store.interrupt_dead(desk.now, alone=True)
+            desk.store.interrupt_lost(desk.now, alone=True)
             desk.busy = "held by scan 7"
             desk.look(minutes=5)
             desk.busy = None
@@ -488,7 +488,7 @@ def test_cut_at_any_change_leaves_one_row_for_each_due_time_and_begins_no_run_tw
             break
     assert number > 12, "two looks make as many changes"
     desk = new_desk(now=desk.now)
-    desk.store.interrupt_dead(desk.now, alone=True)
+    desk.store.interrupt_lost(desk.now, alone=True)
     desk.store.record_due(desk.now)
     runs = desk.store.runs(often.id, limit=1000)
     assert sum(run.count for run in runs) == often.order.cron.count(START + timedelta(seconds=1), desk.now, most=1000)

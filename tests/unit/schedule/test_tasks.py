@@ -151,9 +151,9 @@ def test_work_that_needs_a_positioner_is_refused_where_there_is_none(tmp_path: P
     bench.manager.start()
     bench.open()
     for task, options in orders:
-        with pytest.raises(ScheduleError, match="no positioner, and nobody is there to move anything"):
+        with pytest.raises(ScheduleError, match="no positioner, and a schedule cannot rely on a person"):
             checked(bench.tasks, task, options)
-    with pytest.raises(ScheduleError, match="no positioner, and nobody is there to move anything"):
+    with pytest.raises(ScheduleError, match="no positioner, and a schedule cannot rely on a person"):
         bench.do(TaskKind.CALIBRATION, board=BOARD)
     assert bench.calibrations.latest() == []
     checked(bench.tasks, TaskKind.VERIFICATION, {"board": BOARD})
