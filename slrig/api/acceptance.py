@@ -23,7 +23,7 @@ router = APIRouter(prefix="/acceptance", tags=["acceptance"])
 
 
 class PositionRequest(Strict):
-    """What to measure: the next position, whose artefact stands there, or by script all that are left."""
+    """Measurement of the next position, with its artefact in place, or by script of all that are left."""
 
     scripted: bool = False
     if_busy: Literal["reject", "queue"] = "reject"
@@ -110,7 +110,7 @@ def list_acceptance(service: Serving, limit: Annotated[int, Query(ge=1, le=200)]
 
 @router.get("/{test_id}")
 def look_at_acceptance(service: Serving, test_id: UUID) -> AcceptanceBody:
-    """Return a test: what to do next, what was measured, and what was decided."""
+    """Return a test: the next step, the measurements, and the decision."""
     return _body(service.acceptance.get(test_id))
 
 

@@ -78,9 +78,9 @@ class Methods:
             refusal = answer(problem(405, "method-not-allowed", detail), headers={"Allow": listed})
             await refusal(scope, receive, send)
         elif method == "HEAD":
-            asked = {**scope, "method": "GET"}
+            as_get = {**scope, "method": "GET"}
             try:
-                await self._app(asked, receive, _head_only(asked, scope, send))
+                await self._app(as_get, receive, _head_only(as_get, scope, send))
             except _HeadSentError:
                 return
         else:
@@ -94,13 +94,13 @@ class Methods:
 
 
 class _HeadSentError(Exception):
-    """Ends the making of an answer of which only the head was asked for."""
+    """Ends the making of an answer after its head, for a HEAD request."""
 
 
-def _head_only(asked: Scope, scope: Scope, send: Send) -> Send:
+def _head_only(as_get: Scope, scope: Scope, send: Send) -> Send:
     async def head(message: Message) -> None:
-        # Whoever measures outside of this looks for it there.
-        scope["route"] = asked.get("route")
+        # Outer middleware reads it there.
+        scope["route"] = as_get.get("route")
         await send(message)
         await send({"type": "http.response.body"})
         raise _HeadSentError
@@ -166,7 +166,7 @@ def bare_app() -> FastAPI:
 def create_app(service: Service, *, ring: KeyRing | None, cookie: str = "slrig_session") -> FastAPI:
     """The application over a service, which it starts and closes.
 
-    ring : its keys; None leaves it open to all. cookie : the name of what a browser that is logged in sends.
+    ring : its keys; None leaves it open to all. cookie : the name of the cookie of a logged-in browser.
     """
     settings = service.settings
     app = bare_app()
@@ -195,7 +195,7 @@ def create_app(service: Service, *, ring: KeyRing | None, cookie: str = "slrig_s
 @asynccontextmanager
 async def _life(app: FastAPI) -> AsyncIterator[None]:
     service: Service = app.state.service
-    # One for each connection: shares say how many answers are made at once, and nobody waits for another one's thread.
+    # One for each connection: shares limit how many answers are made at once, and none waits for another's thread.
     current_default_thread_limiter().total_tokens = service.settings.max_connections
     service.start()
     try:
@@ -236,7 +236,7 @@ def show_interface() -> Response:
 
 @router.get("/start.js")
 def start_page() -> Response:
-    """What the page does at its start, in a file of its own: scripts within the page are forbidden."""
+    """The page's start script, in a file of its own: scripts within the page are forbidden."""
     return Response(_START, media_type="text/javascript")
 
 

@@ -91,19 +91,19 @@ _adapter = TypeAdapter(_KeyFile)
 
 
 def digest(key: str) -> str:
-    """What is kept of a key."""
+    """The stored digest of a key."""
     return hashlib.sha256(key.encode()).hexdigest()
 
 
 class KeyRing:
-    """The keys in a file, and the one of the environment beside them, which is kept nowhere.
+    """The keys in a file, and the one of the environment, which is kept nowhere.
 
     Raises
     ------
     ConfigError
         The given key is too short or cannot travel in a header.
     StorageError
-        Here and in every call: the file cannot be read or written, or somebody changed it into something else.
+        Here and in every call: the file cannot be read or written, or is no longer a file of keys.
     """
 
     def __init__(self, path: Path, *, given: str | None = None, clock: Clock = utc_now) -> None:
@@ -111,23 +111,23 @@ class KeyRing:
         self._clock = clock
         self._given = None if given is None else _given_key(given, clock())
         self._local: Key | None = None
-        self._seen: tuple[int, int, int] | None = None
+        self._stamp: tuple[int, int, int] | None = None
         self._by_digest: dict[str, Key] = {}
-        self._look()
+        self._reload()
 
     def find(self, sent: str) -> Key | None:
-        """The key that somebody sent, if it is one, whether or not it still opens anything."""
+        """The key that was sent, if it is known, even one that has ended."""
         return self.by_digest(digest(sent))
 
     def by_digest(self, identity: str) -> Key | None:
         """The key of a digest, which is its identity: a name may pass on to another key."""
         if self._local is not None and self._local.digest == identity:
             return self._local
-        self._look()
+        self._reload()
         return self._by_digest.get(identity)
 
     def admit(self, key: str) -> None:
-        """Let in those who send this key, which is kept nowhere, as long as this process runs: see `local_key`."""
+        """Accept this key, which is kept nowhere, as long as this process runs: see `local_key`."""
         self._local = Key(name=LOCAL_NAME, digest=digest(key), scopes=ALL_SCOPES, created_at=self._clock())
 
     def named(self, name: str) -> Key | None:
@@ -137,16 +137,14 @@ class KeyRing:
     @property
     def everybody(self) -> tuple[Key, ...]:
         """Every key, from old to new."""
-        self._look()
+        self._reload()
         return tuple(self._by_digest.values())
 
     def add(self, name: str, scopes: Iterable[KeyScope], *, life: timedelta | None = None) -> str:
-        """Make a key and return it: this is the only time that it is seen. Raises ConfigError: the name is taken, or is
-        none.
-        """
+        """Make a key and return it: it is shown only now. Raises ConfigError: the name is taken or invalid."""
         if not re.fullmatch(KEY_NAME, name):
             message = (
-                f"{name!r} is no name for a key: expected up to 64 letters, digits, spaces and any of "
+                f"{name!r} cannot name a key: expected up to 64 letters, digits, spaces and any of "
                 "'._@-', the first a letter or a digit. Name the person or the program that gets it."
             )
             raise ConfigError(message)
@@ -167,13 +165,13 @@ class KeyRing:
         return key
 
     def revoke(self, name: str) -> None:
-        """Have the key of a name open nothing any more. Raises ConfigError: there is none."""
+        """Revoke the key of a name. Raises ConfigError: there is none."""
         now = self._clock()
         with self._changing() as keys:
             found = [place for place, key in enumerate(keys) if key.name == name and key.fault(now) is None]
             if not found:
                 known = ", ".join(sorted(key.name for key in keys if key.fault(now) is None)) or "none at all"
-                message = f"There is no key of the name '{name}' that could be revoked, but {known}."
+                message = f"There is no key '{name}' to revoke. There are: {known}."
                 raise ConfigError(message)
             keys[found[0]] = keys[found[0]].model_copy(update={"revoked_at": now})
 
@@ -186,21 +184,21 @@ class KeyRing:
             write_file(self._path, _adapter.dump_json(file, indent=1) + b"\n")
             self._path.chmod(0o600)
 
-    def _look(self) -> None:
+    def _reload(self) -> None:
         try:
             found = self._path.stat()
         except FileNotFoundError:
-            seen = (0, 0, 0)
+            stamp = (0, 0, 0)
         except OSError as error:
             message = f"The keys in {self._path} cannot be read: {error.strerror}. See that slrig may read the file."
             raise StorageError(message) from error
         else:
-            seen = (found.st_mtime_ns, found.st_ino, found.st_size)
-        if seen == self._seen:
+            stamp = (found.st_mtime_ns, found.st_ino, found.st_size)
+        if stamp == self._stamp:
             return
         keys = self._read()
         self._by_digest = {key.digest: key for key in (*keys, *([] if self._given is None else [self._given]))}
-        self._seen = seen
+        self._stamp = stamp
 
     def _read(self) -> tuple[Key, ...]:
         try:
@@ -210,7 +208,7 @@ class KeyRing:
         except (OSError, ValidationError) as error:
             message = (
                 f"The keys in {self._path} cannot be read: {_first_line(error)}. Restore the file from a "
-                "backup, or remove it and make the keys anew with `slrig key add`."
+                "backup, or remove it and make new keys with `slrig key add`."
             )
             raise StorageError(message) from error
 
@@ -257,8 +255,8 @@ def local_key(port: int) -> Iterator[str | None]:
 
 
 def first_key(ring: KeyRing, *, fresh: bool) -> str | None:
-    """The key that a service makes at its start, to be shown once: where there is none, or a `fresh` one is asked for,
-    which takes the place of the one made so before. None where none is made.
+    """The key that a service makes at its start, to be shown once: where there is none, or where a `fresh` one is
+    requested, which replaces an earlier one of this kind. None where none is made.
     """
     if fresh:
         owner = ring.named(FIRST_NAME)
@@ -293,7 +291,7 @@ class Sessions:
 
     def __init__(self, ring: KeyRing, *, cookie: str, clock: Clock = utc_now) -> None:
         self.ring = ring
-        # Cookies do not tell ports apart: two services of one machine need two names.
+        # Cookies do not distinguish ports: two services of one machine need two names.
         self.cookie = cookie
         self._clock = clock
         self._open: dict[str, Session] = {}
@@ -339,7 +337,7 @@ class Sessions:
         return secret, session
 
     def find(self, secret: str) -> Session | None:
-        """The session that a cookie stands for."""
+        """The session of a cookie."""
         found = self._open.get(digest(secret))
         return found if found is not None and found.expires_at > self._clock() else None
 
@@ -443,29 +441,29 @@ def _set_cookie(request: Request, response: Response, sessions: Sessions, secret
 
 PROBES = frozenset({"/livez", "/readyz"})
 OPEN_PATHS = frozenset({"/", *PROBES, LINK_PATH})
-"""What answers without a key: the page, which asks for one, probes, which tell nothing about scans, and the link that
-stands for a key."""
+"""Paths that answer without a key: the page, which asks for one, probes, which show nothing of scans, and the link that
+replaces a key."""
 
 _NAVIGATED = "navigate"
 _JSON_TYPES = frozenset({"application/json", "application/problem+json"})
 _BURST_S = 4.0
-"""How many seconds' worth of requests may come at once: a page with its pictures."""
+"""Seconds' worth of requests that may come at once: a page with its pictures."""
 _MOST_COUNTED = 1024
-_TOLD_EVERY_S = 60.0
-"""How often it is put on record that a key sends too many requests: each of them would fill the record."""
+_NOTED_EVERY_S = 60.0
+"""Interval of records that a key sends too many requests: one for each would fill the record."""
 _MOST_HELD = 128
 _HELD_S = 1.0
-"""How long a request that is one too many waits for its refusal: whoever sends the next one at once sends few."""
-_LOOK_AGAIN_S = 5.0
-"""How long a stream may go on that was begun with a key that has been revoked, or has expired, since then."""
+"""Delay of the refusal of a request that is one too many: it slows clients that repeat at once."""
+_CHECK_AGAIN_S = 5.0
+"""Longest time that a stream goes on after its key was revoked or has expired."""
 
 _log = structlog.get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who sent a request, what their key is for, and until when it, or their session, is good. key : its digest, ""
-    where nobody is asked for one.
+    """The sender of a request, the scopes of their key, and the end of that or of their session. key : its digest, ""
+    where none is needed.
     """
 
     name: str
@@ -475,10 +473,9 @@ class Caller:
 
 
 class Access:
-    """Middleware that lets a request pass by the key or the session that comes with it.
+    """Middleware that admits a request by its key or session.
 
-    ring, sessions : None lets everybody pass. per_second : how many requests of one name, or from one address without a
-    key, are answered.
+    ring, sessions : None admits all. per_second : answered requests of one name, or from one address without a key.
     """
 
     def __init__(
@@ -524,19 +521,19 @@ class Access:
             return
         scope.setdefault("state", {})["caller"] = caller
         status, made, life = 0, "", CancelScope()
-        next_look: asyncio.TimerHandle | None = None
+        next_check: asyncio.TimerHandle | None = None
 
-        def look_later() -> None:
-            nonlocal next_look
-            next_look = asyncio.get_running_loop().call_later(_LOOK_AGAIN_S, look)
+        def check_later() -> None:
+            nonlocal next_check
+            next_check = asyncio.get_running_loop().call_later(_CHECK_AGAIN_S, check)
 
-        def look() -> None:
+        def check() -> None:
             try:
                 self._caller(headers, path)
             except Refused:
                 life.cancel()
             else:
-                look_later()
+                check_later()
 
         async def noted(message: Message) -> None:
             nonlocal status, made
@@ -546,22 +543,22 @@ class Access:
                 status, made = message["status"], kept.get("location", "")
                 if "content-length" not in kept:
                     # It may be a stream, and last.
-                    look_later()
+                    check_later()
 
         name = ANYONE if caller is None else caller.name
         try:
             with acting_as(name, key="" if caller is None else caller.key), life:
                 await self._app(scope, receive, noted)
         finally:
-            if next_look is not None:
-                next_look.cancel()
+            if next_check is not None:
+                next_check.cancel()
         if life.cancelled_caught:
             await send({"type": "http.response.body", "body": b"", "more_body": False})
         if method not in READING or path == LINK_PATH:
             await self._note(name, address, method, path, status, made)
 
     def _caller(self, headers: Headers, path: str) -> Caller | None:
-        """Who sends a request; None for what needs no key."""
+        """The sender of a request; None for paths that need no key."""
         if self._ring is None or self._sessions is None:
             return Caller(ANYONE)
         if path in OPEN_PATHS or path.startswith(f"{FILES_PATH}/"):
@@ -569,19 +566,19 @@ class Access:
         try:
             return self._known(self._ring, self._sessions, headers)
         except StorageError as error:
-            # A stranger is not told where the file lies.
+            # The path of the file stays hidden from strangers.
             _log.error("keys cannot be read", error=str(error))
-            detail = "The service cannot read its keys, and lets nobody in. Its log says what to do."
+            detail = "The service cannot read its keys, and refuses all requests. Its log says what to do."
             raise Refused(507, error.code, detail) from error
 
     def _known(self, ring: KeyRing, sessions: Sessions, headers: Headers) -> Caller:
         sent = _sent_key(headers)
         if sent is not None:
-            return _let_in(ring.find(sent))
+            return _admitted(ring.find(sent))
         cookie = cookie_parser(headers.get("cookie", "")).get(sessions.cookie)
         session = None if cookie is None else sessions.find(cookie)
         if session is not None:
-            owner = _let_in(ring.by_digest(session.key))
+            owner = _admitted(ring.by_digest(session.key))
             return replace(owner, expires_at=session.expires_at)
         raise _unauthorized("This service needs an API key." if cookie is None else "The session is over.")
 
@@ -606,7 +603,7 @@ class Access:
             await self._note(caller.name, address, method, path, refusal.status, "")
         response: Response = answer(problem(refusal.status, refusal.code, str(refusal)), headers=refusal.headers)
         if refusal.status == 401 and method == "GET" and "text/html" in Headers(scope=scope).get("accept", ""):
-            # Somebody with a browser, who can log in at the page.
+            # A person with a browser, who can log in at the page.
             response = RedirectResponse("/", status_code=303)
         await response(scope, receive, send)
 
@@ -614,7 +611,7 @@ class Access:
         try:
             await run_in_threadpool(self._audit.note, name, address, method, path, status, made)
         except StorageError as error:
-            # What was done is done: the answer stands.
+            # The request was served: its answer stays.
             _log.warning("not put on record", who=name, method=method, path=path, status=status, error=str(error))
 
 
@@ -632,7 +629,7 @@ def refuse_foreign_page(headers: Headers, method: str, path: str, *, by_cookie: 
     """Refuse what another site's page, or another service's of this machine, has a browser send.
 
     Browsers say where a request comes from: in Sec-Fetch-Site (W3C Fetch Metadata), where the address is this machine
-    or encrypted, and in Origin with all that writes. A page cannot change either. A link that somebody follows may come
+    or encrypted, and in Origin with all that writes. A page cannot change either. A link may be followed
     from anywhere, if it moves nothing. Programs send neither header. A picture that moves light, by cookie and without
     either, must say in Referer that it is on a page of ours. Raises Refused.
     """
@@ -654,7 +651,7 @@ def refuse_foreign_page(headers: Headers, method: str, path: str, *, by_cookie: 
 
 
 def refuse_other_types(headers: Headers, method: str, path: str) -> None:
-    """Refuse a body that a form of any page could send: what is no JSON, and no file to import. Raises Refused."""
+    """Refuse a body that a form of any page could send: neither JSON nor a file to import. Raises Refused."""
     kind = headers.get("content-type", "").partition(";")[0].strip().lower()
     has_body = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
     if method in READING or path == IMPORT_PATH or kind in _JSON_TYPES or not (kind or has_body):
@@ -670,7 +667,7 @@ def _authority(url: str) -> str:
         return ""
 
 
-def _let_in(key: Key | None) -> Caller:
+def _admitted(key: Key | None) -> Caller:
     if key is None:
         raise _unauthorized("Unknown API key.")
     fault = key.fault(utc_now())
@@ -681,8 +678,8 @@ def _let_in(key: Key | None) -> Caller:
 
 def _unauthorized(found: str) -> Refused:
     detail = (
-        f"{found} Send a key as 'Authorization: Bearer KEY' or 'X-API-Key: KEY'. Whoever runs the service makes one "
-        "with `slrig key add NAME`."
+        f"{found} Send a key as 'Authorization: Bearer KEY' or 'X-API-Key: KEY'. The operator of the service makes "
+        "one with `slrig key add NAME`."
     )
     return Refused(401, "unauthorized", detail, {"WWW-Authenticate": "Bearer"})
 
@@ -692,8 +689,8 @@ def refuse_out_of_scope(caller: Caller, needed: KeyScope) -> None:
     if needed in caller.scopes:
         return
     detail = (
-        f"The key of '{caller.name}' is for {', '.join(caller.scopes)}, and this takes one to {needed}. Ask "
-        f"whoever runs the service for it: `slrig key add NAME --scope {needed}`."
+        f"The key of '{caller.name}' is for {', '.join(caller.scopes)}, and this takes one to {needed}. Ask the "
+        f"operator of the service for one: `slrig key add NAME --scope {needed}`."
     )
     raise Refused(403, "scope", detail)
 
@@ -706,8 +703,8 @@ def _sent_key(headers: Headers) -> str | None:
 
 
 class Rates:
-    """How many requests each key, or address without one, may send: so many a second, and a few seconds' worth at once
-    (a token bucket).
+    """Limit of the requests of each key, or address without one: so many a second, and a few seconds' worth at once (a
+    token bucket).
 
     >>> rates = Rates(1, clock=lambda: 0.0)
     >>> for _ in range(4): rates.count("key of ann", "ann")
@@ -727,15 +724,15 @@ class Rates:
         """Count one request of a sender, called so in the refusal. Raises Refused: it is one too many."""
         now = self._clock()
         most = max(self._per_second * _BURST_S, 1.0)
-        left, since, told = self._left.pop(sender, (most, now, -math.inf))
+        left, since, noted = self._left.pop(sender, (most, now, -math.inf))
         left = min(left + (now - since) * self._per_second, most)
-        allowed, tell = left >= 1.0, now >= told + _TOLD_EVERY_S
-        self._left[sender] = (left - 1.0, now, told) if allowed else (left, now, now if tell else told)
+        allowed, note = left >= 1.0, now >= noted + _NOTED_EVERY_S
+        self._left[sender] = (left - 1.0, now, noted) if allowed else (left, now, now if note else noted)
         if len(self._left) > _MOST_COUNTED:
             self._left.popitem(last=False)
         if not allowed:
             detail = f"'{name}' sends more than {self._per_second:g} requests a second. Wait a second, then send fewer."
-            raise Refused(429, "too-many-requests", detail, {"Retry-After": "1"}, noted=tell)
+            raise Refused(429, "too-many-requests", detail, {"Retry-After": "1"}, noted=note)
 
 
 LOCAL_NAMES = ("localhost", "127.0.0.1", "[::1]")
@@ -747,11 +744,11 @@ _PASS_OVER_S = 1.0
 _HEADERS = {
     # What is sent as a picture or as text is never run.
     "X-Content-Type-Options": "nosniff",
-    # Our pages load from here alone, and nobody frames them.
+    # Our pages load from here alone, and no page may frame them.
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; style-src 'self' 'unsafe-inline'; "
     "object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'",
     "X-Frame-Options": "DENY",
-    # No other site's page shows our pictures, holds our window, or is told which page a link was on.
+    # No other site's page shows our pictures, holds our window, or learns which page a link was on.
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Referrer-Policy": "same-origin",
@@ -800,7 +797,7 @@ class BodyLimits:
 
 async def _pass_over(scope: Scope, receive: Receive) -> None:
     """Take what a client is still sending, for a moment: a connection that is closed with bytes unread is reset, and
-    a proxy then loses the answer. One that waits to be told to send has sent nothing.
+    a proxy then loses the answer. One that waits for a permission to send has sent nothing.
     """
     if any(name == b"expect" for name, _ in scope["headers"]):
         return

@@ -136,7 +136,7 @@ class SolveRequest(Strict):
 
 
 class PoseLinks(BaseModel):
-    """Where to go from a pose."""
+    """Links of a pose."""
 
     self: str
     events: str
@@ -157,7 +157,7 @@ class PoseBody(BaseModel):
     exposure_s: float | None
     answer: dict[str, Any] | None = Field(
         description="by camera: corners found, share of the image filled, tilt, distance, sharpness, saturation, "
-        "movement; and warnings in words"
+        "movement; and warnings as text"
     )
     error: FaultBody = Field(description="why it was refused, and what to do")
     seconds: float | None = Field(description="from the last frame to the answer")
@@ -165,14 +165,14 @@ class PoseBody(BaseModel):
 
 
 class CalibrationLinks(BaseModel):
-    """Where to go from a calibration. `files` holds those that are ready."""
+    """Links of a calibration. `files` holds those that are ready."""
 
     self: str
     events: str
     pose: str
     solve: str
     activate: str
-    coverage: dict[str, str] = Field(description="by device: a picture of what is covered, and where to go next")
+    coverage: dict[str, str] = Field(description="by device: a picture of the coverage, and the board's next place")
     files: dict[str, str]
 
 
@@ -214,10 +214,10 @@ class CalibrationBody(CalibrationSummary):
     patterns: PatternPlan
     shot: list[PoseBody] = Field(description="every pose, refused and failed ones too")
     script: list[int] = Field(description="positions of the positioner that are still to be taken")
-    pinned: bool = Field(description="kept, whatever the settings say of old calibrations")
+    pinned: bool = Field(description="kept, also where the settings remove old calibrations")
     coverage: dict[str, Any] | None = Field(
         description="by device: a 6 x 6 grid of how many poses were seen where, depths, tilts and turns; and what is "
-        "still missing, in words"
+        "still missing, as text"
     )
     next_move: dict[str, Any] | None = Field(description="what to move next, and why")
     progress: ProgressBody | None = Field(description="of what is under way")
@@ -249,7 +249,7 @@ class DifferenceBody(BaseModel):
 
 
 class DeviceDifferenceBody(BaseModel):
-    """What differs of one device; the last two are null for the first camera, which both start from."""
+    """Differences of one device; the last two are null for the first camera, which both start from."""
 
     focal_percent: DifferenceBody
     principal_px: DifferenceBody
@@ -327,7 +327,7 @@ def _summary(record: SessionRecord, active: UUID | None, files: Mapping[str, str
 
 IMPORT_PATH = "/calibration/import"
 MOST_IMPORT_BYTES = MAX_CALIBRATION_BYTES
-"""How long the body of an import may be: a covariance is longer than any other request."""
+"""Longest body of an import: a covariance is longer than any other request."""
 
 _ENDINGS = {
     "application/json": ".json",
@@ -466,7 +466,7 @@ async def compare_calibrations(service: Serving, first: UUID, second: UUID) -> C
 
 @router.get("/{calibration_id}")
 def look_at_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
-    """Return a calibration: its poses with their answers, what is covered, what to move next, and what came of it."""
+    """Return a calibration: its poses with their answers, its coverage, the next move, and the result."""
     return _answered(service, service.calibrations.register.get(calibration_id))
 
 
@@ -478,11 +478,11 @@ def shoot_pose(
     request: Annotated[PoseRequestBody, Body(default_factory=PoseRequestBody)],
     idempotency_key: IdempotencyKey = None,
 ) -> PoseBody:
-    """Shoot a pose of the board. The answer comes at once; look at the pose for what was found."""
-    asked, wait = PoseRequest(request.position, request.exposure_s), request.if_busy == "queue"
+    """Shoot a pose of the board. The answer comes at once; GET the pose for the result."""
+    wanted, wait = PoseRequest(request.position, request.exposure_s), request.if_busy == "queue"
 
     def shoot(key: str | None) -> PoseRecord:
-        return service.calibrations.shoot(calibration_id, asked, wait=wait, key=key)
+        return service.calibrations.shoot(calibration_id, wanted, wait=wait, key=key)
 
     return _accepted(service, response, calibration_id, "pose", idempotency_key, request, shoot)
 
@@ -495,13 +495,13 @@ def shoot_script(
     request: Annotated[ScriptRequest, Body(default_factory=ScriptRequest)],
     idempotency_key: IdempotencyKey = None,
 ) -> PoseBody:
-    """Have the positioner take its poses one after the other, and shoot each; return the first. Other work may come
-    between two of them. To stop, cancel the pose that is under way.
+    """Shoot the poses of the positioner one after the other; return the first. Other work may come between two of them.
+    To stop, cancel the pose that is under way.
     """
-    asked, wait = PoseRequest(None, request.exposure_s), request.if_busy == "queue"
+    wanted, wait = PoseRequest(None, request.exposure_s), request.if_busy == "queue"
 
     def shoot(key: str | None) -> PoseRecord:
-        return service.calibrations.script(calibration_id, request.positions, asked, wait=wait, key=key)
+        return service.calibrations.script(calibration_id, request.positions, wanted, wait=wait, key=key)
 
     return _accepted(service, response, calibration_id, "script", idempotency_key, request, shoot)
 
@@ -528,7 +528,7 @@ def _accepted(
 def observed_boards(
     service: Service, session_id: UUID, numbers: Sequence[int] | None
 ) -> tuple[list[PoseObservation], Board, Calibration]:
-    """What was read of poses of a session, None for all that were accepted, their board, and the calibration in use.
+    """Observations of poses of a session, None for all that were accepted, their board, and the calibration in use.
 
     Raises CalibrationNotFoundError; ConfigError: there are no such poses; CalibrationStateError: none is in use.
     """
@@ -548,7 +548,7 @@ def observed_boards(
 
 @router.get("/{calibration_id}/pose/{number}")
 def look_at_pose(service: Serving, calibration_id: UUID, number: int) -> PoseBody:
-    """Return a pose: its state, and what was found, or why it was refused and what to do."""
+    """Return a pose: its state, and its findings, or why it was refused and what to do."""
     register = service.calibrations.register
     pose = register.pose(calibration_id, number)
     return pose_body(calibration_id, pose, register.get(calibration_id).cameras)
@@ -556,7 +556,7 @@ def look_at_pose(service: Serving, calibration_id: UUID, number: int) -> PoseBod
 
 @router.post("/{calibration_id}/pose/{number}/cancel", status_code=202)
 def cancel_pose(service: Serving, calibration_id: UUID, number: int) -> PoseBody:
-    """Ask a pose to end early, and with it the script that it is part of. May be repeated."""
+    """Request the early end of a pose, and of the script that it is part of. May be repeated."""
     pose = service.calibrations.cancel(calibration_id, number)
     return pose_body(calibration_id, pose, service.calibrations.register.get(calibration_id).cameras)
 
@@ -571,32 +571,32 @@ def drop_pose(service: Serving, calibration_id: UUID, number: int) -> None:
 def solve_calibration(
     service: Serving, calibration_id: UUID, request: Annotated[SolveRequest, Body(default_factory=SolveRequest)]
 ) -> CalibrationBody:
-    """Solve the calibration from its accepted poses. The answer comes at once; `progress` tells how far it is."""
+    """Solve the calibration from its accepted poses. The answer comes at once; `progress` shows how far it is."""
     shape, measured_mm = request.board_shape, request.measured_mm
     return _answered(service, service.calibrations.solve(calibration_id, board_shape=shape, measured_mm=measured_mm))
 
 
 @router.post("/{calibration_id}/activate", responses=problems(409, 507))
 def activate_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
-    """Have the scans that follow use this calibration in place of the rig's own, after a restart too."""
+    """Use this calibration for further scans in place of the rig's own, after a restart too."""
     return _answered(service, service.calibrations.activate(calibration_id))
 
 
 @router.post("/{calibration_id}/deactivate", responses=problems(409, 507))
 def deactivate_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
-    """Have the scans that follow use the rig's own calibration again."""
+    """Use the rig's own calibration for further scans again."""
     return _answered(service, service.calibrations.deactivate(calibration_id))
 
 
 @router.put("/{calibration_id}/pin", responses=problems(507))
 def pin_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
-    """Keep a calibration, whatever the settings say of old ones. DELETE lets it go the way of the others again."""
+    """Keep a calibration, also where the settings remove old ones. DELETE ends that."""
     return _answered(service, service.calibrations.pin(calibration_id, pinned=True))
 
 
 @router.delete("/{calibration_id}/pin", responses=problems(507))
 def unpin_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
-    """Let a calibration be removed when it is old, where the settings ask for that."""
+    """Remove a calibration when it is old, where the settings say so."""
     return _answered(service, service.calibrations.pin(calibration_id, pinned=False))
 
 
@@ -633,7 +633,7 @@ for _name, _media_type in zip(EXPORTS, ("application/json", "application/yaml", 
 def fetch_calibration_report(service: Serving, calibration_id: UUID) -> Response:
     """Return the report of the last solve: one page that holds everything that it shows and runs no script."""
     path = service.calibrations.file(calibration_id, REPORT)
-    # It asks nobody for anything, and nothing in it may.
+    # It loads nothing, and nothing in it may.
     policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
     headers = {"Cache-Control": "no-store", "Content-Security-Policy": policy}
     return FileResponse(path, media_type="text/html", headers=headers)
@@ -670,7 +670,7 @@ async def fetch_coverage_picture(
         str | None, Query(pattern=CAMERA_NAME, description="a camera, or projector. Default: the first camera")
     ] = None,
 ) -> Response:
-    """Return a picture of what a device has seen of the board so far, and of where the board should go next."""
+    """Return a picture of a device's views of the board so far, and of the next position of the board."""
     draw = partial(service.calibrations.coverage_picture, calibration_id, device)
     content = await service.makings.of((calibration_id, "coverage", device), draw)
     return Response(content, media_type="image/png", headers={"Cache-Control": "no-store"})

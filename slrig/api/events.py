@@ -1,4 +1,4 @@
-"""What happens to jobs and to calibrations, as server-sent events that can be resumed."""
+"""Events of jobs and of calibrations, as server-sent events that can be resumed."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from slrig.jobs.records import RIG_JOBS, JobEvent, JobKind, JobState
 from slrig.jobs.store import EVERY_JOB, JobStore
 
 _HEADERS = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-"""Of a stream: a proxy passes each event on at once, as nginx does by the second."""
+"""Headers of a stream: a proxy passes each event on at once, as nginx does by the second."""
 
 _BATCH = 500
-"""How many events of all jobs are looked up at once."""
+"""Most events of all jobs in one query."""
 
-_MOST_LOOKS = 16
-"""How many looks are kept for those who come to the same place after."""
+_MOST_QUERIES = 16
+"""Most queries kept for later followers at the same position."""
 
 _SOLVES = {
     JobState.QUEUED: SessionState.OPEN,
@@ -39,10 +39,10 @@ _SOLVES = {
     JobState.FAILED: SessionState.FAILED,
     JobState.INTERRUPTED: SessionState.FAILED,
 }
-"""What a calibration is while its newest solve is in a state."""
+"""State of a calibration by the state of its newest solve."""
 
-_SEEN = Header(ge=0, le=2**53, description="number of the last event that was seen; those after it follow")
-LastEventId = Annotated[int, _SEEN]
+_LAST = Header(ge=0, le=2**53, description="number of the last event that was received; those after it follow")
+LastEventId = Annotated[int, _LAST]
 
 router = APIRouter()
 
@@ -53,19 +53,19 @@ async def _until_over() -> AsyncIterator[ExitStack]:
 
 
 Held = Annotated[ExitStack, Depends(_until_over)]
-"""A handler's parameter: what is held until the answer is over, also one whose client was gone before it began."""
+"""A handler's parameter: held until the answer is over, also where the client was gone before it began."""
 
 
 @dataclass(frozen=True, slots=True)
 class Followed:
-    """What is followed.
+    """Source of the events of a stream.
 
-    look : the events after one, and whether no more will come, for now or because it was deleted; asked on another
-    thread. watch : has a call made, from any thread, after each new event; returns the call that ends that. last :
-    number of the newest event. most : how many events a look finds at most; None: all that there are.
+    query : the events after one, and whether no more will come, for now or because it was deleted; called on another
+    thread. watch : calls back, from any thread, after each new event; returns the call that ends that. last : number of
+    the newest event. most : most events of a query; None: all that there are.
     """
 
-    look: Callable[[int], tuple[Sequence[JobEvent], bool]]
+    query: Callable[[int], tuple[Sequence[JobEvent], bool]]
     watch: Callable[[Callable[[], None]], Callable[[], None]]
     last: Callable[[], int]
     most: int | None = None
@@ -81,17 +81,17 @@ _DATA: dict[str, dict[str, Any]] = {
     "state": {"time": _MOMENT, "error": _FAULT},
     "pose": {"time": _MOMENT, "error": _FAULT, "pose": {"type": "integer"}},
 }
-"""What the data of an event hold, by its kind, beside the state of its job."""
+"""Data of an event, by its kind, in addition to the state of its job."""
 
 
 def _event(kind: str, **more: dict[str, Any]) -> dict[str, Any]:
     data = {"state": _TEXT, **_DATA[kind], **more}
     required = [name for name in data if data[name] is not _FAULT]
     content = {"type": "object", "properties": data, "required": required}
-    told = {"type": "string", "contentMediaType": "application/json", "contentSchema": content}
+    text = {"type": "string", "contentMediaType": "application/json", "contentSchema": content}
     return {
         "type": "object",
-        "properties": {"id": {"type": "string", "pattern": "^[0-9]+$"}, "event": {"const": kind}, "data": told},
+        "properties": {"id": {"type": "string", "pattern": "^[0-9]+$"}, "event": {"const": kind}, "data": text},
         "required": ["id", "event", "data"],
     }
 
@@ -108,8 +108,8 @@ def _answers(
     }
 
 
-class SharedLooks:
-    """Looks for new events, made once for all who have seen as much: twenty who follow a scan cost what one does.
+class SharedQueries:
+    """Queries of new events, shared by all followers at the same position: twenty cost the same as one.
 
     Lives on the event loop's thread.
     """
@@ -119,12 +119,12 @@ class SharedLooks:
         self.most = followed.most
         self._followed = followed
         self._followers: set[asyncio.Event] = set()
-        self._looks: dict[int, asyncio.Future[tuple[Sequence[JobEvent], bool]]] = {}
+        self._queries: dict[int, asyncio.Future[tuple[Sequence[JobEvent], bool]]] = {}
         self._unwatch: Callable[[], None] = lambda: None
 
     @property
     def unused(self) -> bool:
-        """Whether nobody follows."""
+        """Whether it has no followers."""
         return not self._followers
 
     def join(self) -> asyncio.Event:
@@ -145,23 +145,23 @@ class SharedLooks:
         self._followers.remove(news)
         if self.unused:
             self._unwatch()
-            self._looks.clear()
+            self._queries.clear()
 
     def _wake(self) -> None:
-        # A look that has begun may lack the newest event: nobody else is given it.
-        self._looks.clear()
+        # A query that has begun may lack the newest event: no other follower gets it.
+        self._queries.clear()
         for news in self._followers:
             news.set()
 
-    async def look(self, after: int) -> tuple[Sequence[JobEvent], bool]:
-        """See `Followed.look`."""
-        if after not in self._looks:
-            if len(self._looks) >= _MOST_LOOKS:
-                # Of those who catch up, each at a place of its own.
-                self._looks.clear()
-            self._looks[after] = asyncio.ensure_future(run_in_threadpool(self._followed.look, after))
-        # One who goes away ends it for nobody else.
-        return await asyncio.shield(self._looks[after])
+    async def query(self, after: int) -> tuple[Sequence[JobEvent], bool]:
+        """See `Followed.query`."""
+        if after not in self._queries:
+            if len(self._queries) >= _MOST_QUERIES:
+                # Followers that catch up, each at a position of its own.
+                self._queries.clear()
+            self._queries[after] = asyncio.ensure_future(run_in_threadpool(self._followed.query, after))
+        # A follower that leaves does not end it for others.
+        return await asyncio.shield(self._queries[after])
 
 
 _EVERYTHING = _answers(
@@ -176,9 +176,9 @@ _EVERYTHING = _answers(
 )
 _JOB = _answers(
     "`progress` events with stage, fraction and detail; `captured` when the rig is free of the job, whose "
-    "frames are brought to disk and computed with then; `file` events with the name of a file that can be fetched from "
-    "then on; `state` events with the new state. The stream ends after the event of a final state. Of jobs that are "
-    "long over there is no `progress`.",
+    "frames are written to disk and reconstructed then; `file` events with the name of a file that can be fetched from "
+    "then on; `state` events with the new state. The stream ends after the event of a final state. Jobs that are "
+    "long over have no `progress`.",
     [_event(kind) for kind in ("progress", "captured", "file", "state")],
     "nothing has happened since the event that was named, and nothing more will",
 )
@@ -232,7 +232,7 @@ async def follow_calibration(
     register = service.calibrations.register
     await run_in_threadpool(register.get, calibration_id)
     followed = Followed(
-        partial(_look_at_calibration, register, calibration_id),
+        partial(_query_calibration, register, calibration_id),
         partial(service.store.watch, calibration_id),
         partial(service.store.last_event_of, calibration_id),
     )
@@ -243,16 +243,16 @@ async def follow_calibration(
 async def follow_everything(
     held: Held,
     service: Serving,
-    last_event_id: Annotated[int | None, _SEEN] = None,
+    last_event_id: Annotated[int | None, _LAST] = None,
     after: Annotated[
         int | None, Query(ge=0, le=2**53, description="as Last-Event-ID: 0 begins with the oldest on record")
     ] = None,
 ) -> Response:
-    """Follow all jobs, whatever their kind. `Last-Event-ID` comes before `after`."""
+    """Follow all jobs of every kind. `Last-Event-ID` comes before `after`."""
     followed = followed_feed(service.store, _BATCH)
-    seen = after if last_event_id is None else last_event_id
-    if seen is not None:
-        return _opened(held, service, EVERY_JOB, followed, seen)
+    begin = after if last_event_id is None else last_event_id
+    if begin is not None:
+        return _opened(held, service, EVERY_JOB, followed, begin)
     now = await run_in_threadpool(followed.last)
     return _opened(held, service, EVERY_JOB, followed, now, begins=now)
 
@@ -264,23 +264,23 @@ async def _follow_job(held: ExitStack, service: Service, kind: JobKind | None, j
 
 
 def followed_feed(jobs: JobStore, most: int) -> Followed:
-    """All jobs as they are followed until the service ends, in looks for so many events."""
+    """All jobs as they are followed until the service ends, in queries of so many events."""
 
-    def look(after: int) -> tuple[Sequence[JobEvent], bool]:
+    def query(after: int) -> tuple[Sequence[JobEvent], bool]:
         # In this order: what ends the service has its last event among those found.
         ended = jobs.ended
         found = jobs.events_of_all(after=after, limit=most)
         return found, ended and len(found) < most
 
-    return Followed(look, partial(jobs.watch, EVERY_JOB), jobs.last_event_of_all, most)
+    return Followed(query, partial(jobs.watch, EVERY_JOB), jobs.last_event_of_all, most)
 
 
 def followed_job(jobs: JobStore, job_id: UUID) -> Followed:
     """A job as it is followed until its state is final; it may be deleted meanwhile."""
 
-    def look(after: int) -> tuple[Sequence[JobEvent], bool]:
+    def query(after: int) -> tuple[Sequence[JobEvent], bool]:
         try:
-            # In this order: what ends between the two looks has its last event among those found.
+            # In this order: a job that ends between the two queries has its last event among those found.
             ended = jobs.get(job_id).state.final
             return jobs.events(job_id, after=after), ended
         except JobNotFoundError:
@@ -292,14 +292,14 @@ def followed_job(jobs: JobStore, job_id: UUID) -> Followed:
         except JobNotFoundError:
             return 0
 
-    return Followed(look, partial(jobs.watch, job_id), last)
+    return Followed(query, partial(jobs.watch, job_id), last)
 
 
-def _look_at_calibration(
+def _query_calibration(
     register: CalibrationRegister, calibration_id: UUID, after: int
 ) -> tuple[Sequence[JobEvent], bool]:
     try:
-        # In this order: what ends between the two looks has its last event among those found.
+        # In this order: a solve that ends between the two queries has its last event among those found.
         record = register.get(calibration_id)
     except CalibrationNotFoundError:
         return (), True
@@ -321,9 +321,9 @@ def _of_calibration(event: JobEvent, pose: int | None) -> JobEvent:
 
 async def _stream(held: ExitStack, service: Service, key: UUID, followed: Followed, after: int) -> Response:
     """The events after one, and those that follow until no more will come. Raises HTTPException 429."""
-    events, over = await run_in_threadpool(followed.look, after)
+    events, over = await run_in_threadpool(followed.query, after)
     if over and not events:
-        # An EventSource that reconnects after the last event is told by 204 to stop trying.
+        # 204 stops an EventSource that reconnects after the last event.
         return Response(status_code=204)
     return _opened(held, service, key, followed, after)
 
@@ -331,15 +331,15 @@ async def _stream(held: ExitStack, service: Service, key: UUID, followed: Follow
 def _opened(
     held: ExitStack, service: Service, key: UUID, followed: Followed, after: int, *, begins: int | None = None
 ) -> Response:
-    """A stream of the events after one. See `told`. Raises HTTPException 429."""
+    """A stream of the events after one. See `event_stream`. Raises HTTPException 429."""
     held.enter_context(service.streams.take())
     keepalive_s = service.settings.keepalive_s
-    stream = told(service.followed, key, followed, after, begins=begins, keepalive_s=keepalive_s)
+    stream = event_stream(service.followed, key, followed, after, begins=begins, keepalive_s=keepalive_s)
     return EventSourceResponse(stream, headers=_HEADERS)
 
 
-async def told(
-    open_looks: dict[UUID, SharedLooks],
+async def event_stream(
+    shared_queries: dict[UUID, SharedQueries],
     key: UUID,
     followed: Followed,
     after: int,
@@ -352,17 +352,17 @@ async def told(
     begins : a number to say first, so that a client that lost the connection before the first event can go on.
     keepalive_s : after so much silence a comment is sent.
     """
-    shared = open_looks.setdefault(key, SharedLooks(followed))
+    shared = shared_queries.setdefault(key, SharedQueries(followed))
     news = shared.join()
     try:
-        # A client that names an event that has not come yet would never be told that it has.
+        # A client that names a future event would never receive it.
         after = min(after, await run_in_threadpool(shared.last))
         over = False
         if begins is not None:
             yield format_sse_event(id=str(begins))
         while not over:
             news.clear()
-            events, over = await shared.look(after)
+            events, over = await shared.query(after)
             for event in events:
                 after = event.number
                 yield format_sse_event(data_str=json.dumps(_data(event)), event=event.kind, id=str(after))
@@ -375,10 +375,10 @@ async def told(
     finally:
         shared.leave(news)
         if shared.unused:
-            open_looks.pop(key, None)
+            shared_queries.pop(key, None)
 
 
 def _data(event: JobEvent) -> dict[str, Any]:
-    """What is sent of an event: a fault as the problem that it is."""
+    """Data sent of an event: a fault as a problem."""
     fault = event.data.get("error")
     return dict(event.data) if fault is None else {**event.data, "error": fault_problem(JobFailure(**fault))}

@@ -55,7 +55,7 @@ from slrig.scan.formats import (
 from slrig.scan.job import cloud_bytes
 from slrig.scan.thumbnail import encode_thumbnail
 
-# A cloud takes the worker half a second and some hundred megabytes: one at a time, whoever asks.
+# A cloud takes the worker half a second and some hundred megabytes: one at a time for all requests.
 _making = threading.Lock()
 
 
@@ -109,11 +109,11 @@ def _make_cloud(service: Service, scan_id: UUID, form: str, camera: str | None, 
         refuse_absent(record, path.name)
     require_whole(service, record, place, *read_entries(place))
     if not _making.acquire(timeout=max(until_s - time.monotonic(), 0.0)):
-        message = f"Another file is made first, and {path.name} has to wait for it. Ask again."
+        message = f"Another file is made first, and {path.name} has to wait for it. Try again."
         raise WorkerBusyError(message)
     try:
         if not service.folder.has_made(place, path.name):
-            task = Task(cloud_bytes, (place, form, camera), what=f"making of {path.name}", remedy="Ask again.")
+            task = Task(cloud_bytes, (place, form, camera), what=f"making of {path.name}", remedy="Try again.")
             data = service.worker.run(task, within_s=max(until_s - time.monotonic(), 0.0))
             # From here, not by the worker: where that is killed nothing is left half written.
             service.folder.require_space(len(data) + service.settings.min_free_bytes)
@@ -183,7 +183,7 @@ def refuse_absent(record: JobRecord, name: str) -> None:
 
 
 def _record(service: Service, scan_id: UUID) -> JobRecord:
-    """Of a scan whose files are being read."""
+    """The record of a scan; notes that its files are being read."""
     record = service.store.get(scan_id, JobKind.SCAN)
     service.retention.reading(scan_id)
     return record
@@ -287,7 +287,7 @@ _SLUG_CHARACTERS = 80
 
 
 def saved_name(record: JobRecord, name: str) -> str:
-    """What a file of a scan or a model is called where it is saved: RIG-LABEL-FILE; without a label, by its time here.
+    """Name of a saved file of a scan or a model: RIG-LABEL-FILE; without a label, by its time here.
 
     Letters and digits of all scripts stay, all else becomes a hyphen: it is one name on every system.
     """
@@ -337,7 +337,7 @@ def _serve(name: str, media_type: str) -> Callable[..., Response | Awaitable[Res
             made = await service.makings.of((scan_id, name), partial(_convert, service, scan_id, name))
         return await run_in_threadpool(_file, service, scan_id, name, media_type, known, made)
 
-    made = " It is made of mesh.ply when it is asked for, and kept once the scan is over." if name in ON_REQUEST else ""
+    made = " It is made of mesh.ply when it is requested, and kept once the scan is over." if name in ON_REQUEST else ""
     fetch.__doc__ = make.__doc__ = (
         f"Return {name} of a scan that succeeded, or that is being reconstructed, as soon as it is there.{made} ETags "
         "are honoured, and ranges once the scan is over."
@@ -345,13 +345,13 @@ def _serve(name: str, media_type: str) -> Callable[..., Response | Awaitable[Res
     return make if name in ON_REQUEST else fetch
 
 
-_UNCHANGED: dict[int | str, dict[str, Any]] = {304: {"description": "the file is the one whose ETag was sent"}}
+_UNCHANGED: dict[int | str, dict[str, Any]] = {304: {"description": "the file has the ETag that was sent"}}
 
 
 def file_answers(media_type: str, *further: int) -> dict[int | str, dict[str, Any]]:
     """The `responses` of a route that answers with a file that never changes."""
-    # A part of a JSON file is no JSON.
-    part = {"description": "the range that was asked for", "content": {media_type: {"schema": BYTES}}}
+    # A part of a JSON file is not JSON.
+    part = {"description": "the requested range", "content": {media_type: {"schema": BYTES}}}
     return {**file_of(media_type, 409, 416, *further), 206: part, **_UNCHANGED}
 
 
@@ -458,7 +458,7 @@ def fetch_agreement(
 async def fetch_bundle(held: Held, service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
     """Return the recorded frames and all that belongs to them; unzipped, `slrig reconstruct` reads them.
 
-    A scan whose reconstruction failed has its bundle, too.
+    A scan with a failed reconstruction has its bundle, too.
     """
     held.enter_context(service.streams.take())
     return await run_in_threadpool(_bundle, service, scan_id, known)
@@ -511,7 +511,7 @@ async def fetch_together(
         path = service.folder.scan(scan_id) / file
         if file in ON_REQUEST and not await run_in_threadpool(service.folder.has_made, path.parent, file):
             if time.monotonic() > until_s:
-                message = f"{number} of {len(scan)} files are made. Ask again for the others."
+                message = f"{number} of {len(scan)} files are made. Try again for the others."
                 raise WorkerBusyError(message)
             await service.makings.of((scan_id, file), partial(_convert, service, scan_id, file))
         record = await run_in_threadpool(_whole_file, service, scan_id, file)
@@ -527,7 +527,7 @@ async def fetch_together(
 
 
 def _whole_file(service: Service, scan_id: UUID, name: str) -> JobRecord:
-    """The record of a scan that is over, whose file is there, as it was made."""
+    """The record of a finished scan with an undamaged file of this name."""
     record, place = _record(service, scan_id), service.folder.scan(scan_id)
     if not record.state.final or not service.folder.owns(place / name):
         refuse_absent(record, name)

@@ -1,4 +1,4 @@
-"""/hand-eye: where the rig is on a robot or before it, by poses of a session; kept with the calibration in use."""
+"""/hand-eye: pose of the rig on or before a robot, by poses of a session; kept with the calibration in use."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _MOST_POSES = 100
 
 PATHS = ("/hand-eye", "/hand-eye/check")
 MOST_BYTES = 2**18
-"""Of a request: 100 poses with all their digits, and of a document."""
+"""Most of a request: 100 poses with all their digits; and of a document."""
 
 router = APIRouter(prefix="/hand-eye", tags=["calibration"])
 
 
 class RobotPose(Strict):
-    """What the rig saw, and where the robot was."""
+    """An observation of the rig, and the robot's pose."""
 
     pose: int | None = Field(default=None, description="its number in the session")
     scan: Annotated[UUID, Field(strict=False)] | None = Field(default=None, description="a scan of the sphere")
@@ -94,7 +94,7 @@ class DriftBody(BaseModel):
 def _in_use(service: Service) -> Calibration:
     _, _, calibration = service.health.health()
     if calibration is None:
-        raise CalibrationStateError("The rig has no calibration in use, in whose frame it is. Activate one first.")
+        raise CalibrationStateError("The rig has no calibration in use, and thus no frame. Activate one first.")
     return calibration
 
 
@@ -102,9 +102,9 @@ def _store(service: Service) -> HandEyeStore:
     return HandEyeStore(service.folder.root)
 
 
-def _seen(service: Service, request: PosesRequest) -> ReadBoards | ScannedSpheres:
-    """What the rig saw. Raises CalibrationNotFoundError, JobNotFoundError, ConfigError, CalibrationStateError; and
-    CalibrationError: a scan is in the frame of another calibration than that in use.
+def _observations(service: Service, request: PosesRequest) -> ReadBoards | ScannedSpheres:
+    """Observations of the rig. Raises CalibrationNotFoundError, JobNotFoundError, ConfigError, CalibrationStateError;
+    and CalibrationError: a scan is in the frame of another calibration than that in use.
     """
     if request.calibration is not None:
         numbers = [int(each.pose or 0) for each in request.poses]
@@ -124,7 +124,7 @@ def _seen(service: Service, request: PosesRequest) -> ReadBoards | ScannedSphere
 
 @router.get("", responses=problems(404, 409))
 def get_hand_eye(service: Serving) -> HandEyeDocument:
-    """Return where the rig is, for the calibration in use."""
+    """Return the rig's pose, for the calibration in use."""
     return _store(service).get(_in_use(service).solve_id)
 
 
@@ -144,15 +144,15 @@ def put_hand_eye(service: Serving, document: Annotated[HandEyeDocument, Body()])
 
 @router.delete("", status_code=204, responses=problems(409, 507))
 def delete_hand_eye(service: Serving) -> None:
-    """Forget where the rig is. Idempotent."""
+    """Delete the rig's pose. Idempotent."""
     _store(service).remove(_in_use(service).solve_id)
 
 
 @router.post("", responses=problems(404, 409, 503, 507))
 def solve_hand_eye(service: Serving, request: Annotated[HandEyeRequest, Body()]) -> HandEyeDocument:
-    """Find where the rig is from poses of a session or scans of a sphere, by the calibration in use, and keep it."""
+    """Find the rig's pose from poses of a session or scans of a sphere, by the calibration in use, and keep it."""
     options = request.model_dump(include={"kind", "robot_sigma", "base_frame", "flange_frame"})
-    given = _seen(service, request), [each.robot_pose for each in request.poses], options
+    given = _observations(service, request), [each.robot_pose for each in request.poses], options
     task = Task(solved_poses, given, what="hand-eye calibration")
     document: HandEyeDocument = service.worker.run(task, within_s=REQUEST_WAIT_S)
     _store(service).put(document)
@@ -161,9 +161,9 @@ def solve_hand_eye(service: Serving, request: Annotated[HandEyeRequest, Body()])
 
 @router.post("/check", responses=problems(404, 409, 503))
 def check_hand_eye(service: Serving, request: Annotated[PosesRequest, Body()]) -> DriftBody:
-    """Hold new poses of the same target, at its place of then, against what is kept: did anything move?"""
+    """Compare new poses of the same target, at its earlier place, with the kept result: did anything move?"""
     kept = _store(service).get(_in_use(service).solve_id)
-    given = _seen(service, request), [each.robot_pose for each in request.poses], kept
+    given = _observations(service, request), [each.robot_pose for each in request.poses], kept
     task = Task(checked_poses, given, what="check of hand-eye")
     return DriftBody(**service.worker.run(task, within_s=REQUEST_WAIT_S))
 

@@ -22,8 +22,8 @@ from slrig.live.room import LiveOptions, LiveStatus, Viewer
 from slrig.live.stream import message
 from slrig.rig.preview import LONGEST_S
 
-_LOOK_S = 0.5
-"""So long without a message, and the client is asked whether it is still there."""
+_WAIT_S = 0.5
+"""Longest wait for a message; then the connection to the client is checked."""
 _STEP = 3
 _TYPE = "application/octet-stream"
 
@@ -79,7 +79,7 @@ class LiveBody(BaseModel):
 
 @router.get("", responses=problems(409))
 def look_at_live(service: Serving) -> LiveBody:
-    """Return the live depth that there is."""
+    """Return the state of live depth."""
     return _body(service.manager.live.status())
 
 
@@ -136,7 +136,7 @@ async def _messages(viewer: Viewer, news: asyncio.Event) -> AsyncIterator[bytes]
                 yield made
                 continue
             try:
-                async with asyncio.timeout(_LOOK_S):
+                async with asyncio.timeout(_WAIT_S):
                     await news.wait()
             except TimeoutError:
                 # Whoever has gone is noticed by it.

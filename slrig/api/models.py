@@ -46,7 +46,7 @@ router = APIRouter(prefix="/model", tags=["model"])
 
 
 class MadeRequest(Strict):
-    """How a model is made of its scans, whether those are on record or still to be shot."""
+    """Options of a model from its scans, whether those are on record or still to be shot."""
 
     poses: Literal["turntable", "markers", "unknown"] | Annotated[list[PoseEntry], Field(max_length=MAX_VIEWS)] = Field(
         default="turntable",
@@ -75,19 +75,19 @@ class MadeRequest(Strict):
 
     @model_validator(mode="after")
     def _of_a_turntable(self) -> Self:
-        told = [name for name in ("angles_deg", "axis") if getattr(self, name, None) is not None]
-        if self.poses != "turntable" and told:
-            message = f'{told[0]}: expected "poses": "turntable" beside it, found other poses; leave one of them out'
+        given = [name for name in ("angles_deg", "axis") if getattr(self, name, None) is not None]
+        if self.poses != "turntable" and given:
+            message = f'{given[0]}: expected "poses": "turntable" with it, found other poses; leave one of them out'
             raise ValueError(message)
         if self.poses != "markers" and self.dictionary is not None:
-            message = 'dictionary: expected "poses": "markers" beside it, found other poses; leave one of them out'
+            message = 'dictionary: expected "poses": "markers" with it, found other poses; leave one of them out'
             raise ValueError(message)
         return self
 
     def plan(
         self, scans: Sequence[UUID], *, angles_deg: Sequence[float] | None = None, shoot: ShootPlan | None = None
     ) -> ModelPlan:
-        """What is asked for. Raises ConfigError: see `ModelPlan`."""
+        """The requested plan. Raises ConfigError: see `ModelPlan`."""
         poses: StartingPoses
         if self.poses == "unknown":
             poses = UnknownPoses()
@@ -120,7 +120,7 @@ class ModelBody(JobBody):
     """A model on record. `plan` has the axis and the angles that it is made with."""
 
     plan: AskedPlan[ModelPlan]
-    pinned: bool = Field(description="kept, whatever the settings say of old models")
+    pinned: bool = Field(description="kept, also where the settings remove old models")
     links: JobLinks
 
 
@@ -131,7 +131,7 @@ class ListedModel(ListedJob):
 
 
 class ModelPage(BaseModel):
-    """Models from new to old. `next` asks for the page after this one, null on the last."""
+    """Models from new to old. `next` is the path of the next page, null on the last."""
 
     models: list[ListedModel]
     next: str | None
@@ -167,7 +167,7 @@ def list_models(service: Serving, response: Response, cursor: Cursor = None, lim
 
 @router.get("/{model_id}")
 def look_at_model(service: Serving, model_id: UUID) -> ModelBody:
-    """Return a model: its state, how far it is, and where its files are."""
+    """Return a model: its state, its progress, and links to its files."""
     return model_body(service, service.store.get(model_id, JobKind.MODEL))
 
 
@@ -179,19 +179,19 @@ def rename_model(service: Serving, model_id: UUID, request: NewName) -> ModelBod
 
 @router.post("/{model_id}/cancel", status_code=202)
 def cancel_model(service: Serving, model_id: UUID) -> ModelBody:
-    """Ask a model to stop, with the views that are shot for it. May be repeated; one that is over stays as it is."""
+    """Request a model and its views to stop. May be repeated; one that is over stays as it is."""
     return model_body(service, service.shooting.cancel(model_id))
 
 
 @router.put("/{model_id}/pin")
 def pin_model(service: Serving, model_id: UUID) -> ModelBody:
-    """Keep a model, whatever the settings say of old ones. DELETE lets it go the way of the others again."""
+    """Keep a model, also where the settings remove old ones. DELETE ends that."""
     return model_body(service, service.store.pin(model_id, JobKind.MODEL, pinned=True))
 
 
 @router.delete("/{model_id}/pin")
 def unpin_model(service: Serving, model_id: UUID) -> ModelBody:
-    """Let a model be removed when it is old, where the settings ask for that."""
+    """Remove a model when it is old, where the settings say so."""
     return model_body(service, service.store.pin(model_id, JobKind.MODEL, pinned=False))
 
 
@@ -248,7 +248,7 @@ IfBusy = Annotated[
 
 
 class ModelShootRequest(MadeRequest):
-    """A model whose views are to be shot, evenly around the object. Poses, if given, are of all views."""
+    """A model of views to be shot evenly around the object. Poses, if given, are of all views."""
 
     views: Annotated[int, Field(ge=2, le=MOST_VIEWS)] = Field(default=8, description="how many")
     scan: ShotRequest = Field(default_factory=ShotRequest, description="how each is shot")
@@ -261,7 +261,7 @@ class ModelShootRequest(MadeRequest):
 
 
 class ViewRequest(Strict):
-    """The object was turned by hand."""
+    """The object was turned manually."""
 
     again: bool = Field(
         default=False, description="shoot the last view once more in its place; the object was not turned on"
@@ -279,7 +279,7 @@ def shoot_model(
     """Shoot an object from all sides, and make one mesh of the views. The answer comes at once; follow `links.events`.
 
     `/scan/series/{id}`, by the id of the model, has the views. One that a device failed is shot again, twice at most;
-    the model is made of those that succeed, and `notes` of its summary tell of the others.
+    the model is made of those that succeed, and `notes` of its summary name the others.
     """
     preset = None if request.scan.preset is None else service.presets.get(request.scan.preset)
     shoot = ShootPlan(request.views, scan_plan(request.scan, service.scan_defaults, preset), request.manual)
@@ -302,7 +302,7 @@ def shoot_view(
     request: Annotated[ViewRequest, Body(default_factory=ViewRequest)],
     idempotency_key: IdempotencyKey = None,
 ) -> ModelBody:
-    """Shoot the next view of a model whose object was turned by hand. After the last one the model is made."""
+    """Shoot the next view of a model of a manually turned object. After the last one the model is made."""
 
     def start(key: str | None) -> UUID:
         wait = request.if_busy == "queue"
@@ -314,5 +314,5 @@ def shoot_view(
 
 @router.post("/{model_id}/combine", status_code=202, responses=problems(409, 507))
 def combine_views(service: Serving, model_id: UUID) -> ModelBody:
-    """Make a model that is shot by hand of the views that there are."""
+    """Make a model of a manually turned object of the views that there are."""
     return model_body(service, service.shooting.combine(model_id))

@@ -36,7 +36,7 @@ class ReceiverList(BaseModel):
 
 
 class TrialBody(BaseModel):
-    """How a test notice went."""
+    """Result of a test notice."""
 
     taken: bool
     answer: str = Field(description="of the receiver, or why there was none")
@@ -52,7 +52,7 @@ def list_receivers(service: Serving) -> ReceiverList:
 
 @router.put("/webhook", responses=problems(507))
 def set_webhook(service: Serving, request: Annotated[WebhookEntry, Body()]) -> ReceiverList:
-    """Have notices sent to an address by POST, from now on and after a restart, in place of the one before. One in the
+    """Send notices to an address by POST, from now on and after a restart, in place of the one before. One in the
     service's settings cannot be changed.
     """
     service.receivers.set_webhook(request)

@@ -46,7 +46,7 @@ _CODES = {
 }
 
 STATUS = {code: status for status, codes in _CODES.items() for code in codes.split()}
-"""Which status stands for which error, by its code. A test holds it against the whole error tree."""
+"""HTTP status by the code of an error. A test compares it with the whole error tree."""
 
 RETRY_AFTER_S = {"rig-busy": 5, "queue-full": 30, "key-in-flight": 1, "worker-busy": 5}
 
@@ -64,7 +64,7 @@ _TITLES = {
     "device": "A device failed",
     "device-busy": "Another program uses the device",
     "device-gone": "A device is gone",
-    "device-state": "A device was asked in the wrong order",
+    "device-state": "A device was called in the wrong order",
     "extra-missing": "A library is missing",
     "foreign-page": "The request comes from another site",
     "idempotency": "The request's key was used for another request",
@@ -86,10 +86,10 @@ _TITLES = {
     "worker-busy": "Too much is computed already",
     "worker-lost": "The computation ended early",
 }
-"""Titles of problems whose codes do not read as words."""
+"""Titles of problems with codes that do not read as titles."""
 
 _MESSAGES = {
-    "extra_forbidden": "There is no such field here; look at its spelling. /openapi.json lists those that there are.",
+    "extra_forbidden": "There is no such field here; check its spelling. /openapi.json lists those that there are.",
     "timezone_aware": "expected the offset from UTC, too, as in 2026-11-20T06:00:00Z",
 }
 
@@ -103,7 +103,7 @@ _PLAIN_DETAILS = {
 
 
 class FieldFault(BaseModel):
-    """One thing wrong with a request: where, what, and what was found there."""
+    """A fault of one field of a request: its path, the fault, and the value found."""
 
     field: str
     message: str
@@ -111,7 +111,7 @@ class FieldFault(BaseModel):
 
 
 class Problem(BaseModel):
-    """What every refusal looks like (RFC 9457). `GET` on `type` explains it."""
+    """Body of every refusal (RFC 9457). `GET` on `type` explains it."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -125,7 +125,7 @@ class Problem(BaseModel):
 
 
 def title_of(code: str) -> str:
-    """What people call a kind of problem.
+    """Title of a kind of problem.
 
     >>> title_of("config"), title_of("queue-full")
     ('A setting does not fit', 'Queue full')
@@ -146,7 +146,7 @@ def problem(status: int, code: str, detail: str, **members: Any) -> dict[str, An
 
 
 def fault_problem(fault: JobFailure) -> dict[str, Any]:
-    """The problem that stands for a scan's recorded fault."""
+    """The problem of a scan's recorded fault."""
     return problem(STATUS.get(fault.code, 500), fault.code, fault.message)
 
 
@@ -156,7 +156,7 @@ def answer(document: Mapping[str, Any], *, headers: Mapping[str, str] | None = N
 
 
 def explanations() -> dict[str, str]:
-    """What each kind of problem means, by its slug: the docstrings of the error tree, and of HTTP's own refusals."""
+    """Meaning of each kind of problem, by its slug: the docstrings of the error tree, and of HTTP's own refusals."""
     tree = {code: " ".join((error.__doc__ or "").split()) for code, error in errors_by_code().items()}
     own = {
         "invalid-request": "The request does not fit what is documented in /openapi.json. `errors` has every fault.",
@@ -171,7 +171,7 @@ def explanations() -> dict[str, str]:
 
 
 def install_problems(app: FastAPI) -> None:
-    """Have every error that a handler raises leave `app` as a problem."""
+    """Convert every error that a handler raises into a problem."""
     app.add_exception_handler(SlrigError, _slrig_error)
     app.add_exception_handler(RequestValidationError, _invalid_request)
     app.add_exception_handler(HTTPException, _http_error)
@@ -213,7 +213,7 @@ async def _http_error(_request: Request, error: Exception) -> JSONResponse:
 
 
 async def _gone(_request: Request, _error: Exception) -> JSONResponse:
-    # For the measurements and the audit: nobody reads it.
+    # For the measurements and the audit: the client is gone.
     return answer(http_problem(HTTPStatus.BAD_REQUEST, "The client went away before all of its request was here."))
 
 
@@ -226,7 +226,7 @@ async def _unexpected(_request: Request, error: Exception) -> JSONResponse:
 
 
 def field_faults(found: Sequence[Any], known: Mapping[str, str] = _NOTHING) -> list[dict[str, Any]]:
-    """What pydantic found, as the `errors` of a problem. What was sent is shown only where it is short.
+    """Faults found by pydantic, as the `errors` of a problem. Values are shown only where they are short.
 
     known : fields and their places, see `model_keys`, of which one is proposed for a misspelt or misplaced one.
     """
@@ -235,18 +235,18 @@ def field_faults(found: Sequence[Any], known: Mapping[str, str] = _NOTHING) -> l
 
 def _field_fault(entry: Any, known: Mapping[str, str]) -> dict[str, Any]:
     if entry["type"] == "json_invalid":
-        message = f"is no JSON: {entry['ctx']['error']} at character {entry['loc'][-1]}"
+        message = f"is not JSON: {entry['ctx']['error']} at character {entry['loc'][-1]}"
         return {"field": "body", "message": message}
     place = [printable(str(part)) for part in entry["loc"] if part != "body"]
     sent = entry.get("input")
     message = printable(_MESSAGES.get(entry["type"], entry["msg"]))
-    if place and entry["type"] == "extra_forbidden" and (words := proposal(place[-1], known)) is not None:
-        message = f"There is no such field here; {words}"
+    if place and entry["type"] == "extra_forbidden" and (advice := proposal(place[-1], known)) is not None:
+        message = f"There is no such field here; {advice}"
     fault: dict[str, Any] = {"field": ".".join(place) or "body", "message": message}
     if isinstance(sent, str) and len(sent) <= 80:
         fault["found"] = printable(sent)
     elif isinstance(sent, float) and not abs(sent) <= 1e300:
-        # NaN and infinities, which Python's JSON reader lets through, are no JSON on the way out.
+        # NaN and infinities, which Python's JSON reader accepts, are not JSON in an answer.
         fault["found"] = str(sent)
     elif isinstance(sent, (bool, int, float)):
         fault["found"] = sent
@@ -254,7 +254,7 @@ def _field_fault(entry: Any, known: Mapping[str, str]) -> dict[str, Any]:
 
 
 def http_problem(status: HTTPStatus, detail: str) -> dict[str, Any]:
-    """The problem that stands for a refusal of HTTP's own."""
+    """The problem of a refusal of HTTP's own."""
     return problem(status.value, _http_code(status), detail)
 
 
@@ -369,7 +369,7 @@ def describe(app: FastAPI) -> dict[str, Any]:
 
 
 def _without_null(parameter: dict[str, Any]) -> None:
-    """Describe a parameter that may be left out as that: in a path, a query or a header there is no null."""
+    """Describe an optional parameter without null, which paths, queries and headers do not have."""
     schema = parameter["schema"]
     if "anyOf" in schema:
         (meant,) = (each for each in schema["anyOf"] if each != {"type": "null"})

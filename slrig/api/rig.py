@@ -69,11 +69,11 @@ _SATURATED = 254
 _TOO_DARK = 12
 """Grey levels of 255 in white light: four times the contrast below which a scan takes a pixel for unlit."""
 _RED, _BLUE = (32, 32, 224), (224, 80, 32)
-_LOOK_S = 0.5
-"""How long one look for a picture holds a thread; then the client is asked whether it is still there."""
+_WAIT_S = 0.5
+"""Longest wait for a picture on a thread; then the connection to the client is checked."""
 
 _FRESH_S = 5.0
-"""How old the result of a search for devices may be."""
+"""Largest age of the result of a search for devices."""
 
 router = APIRouter(tags=["rig"])
 
@@ -89,7 +89,7 @@ _STREAM: dict[int | str, dict[str, Any]] = {
 
 @router.get("/rig")
 def look_at_rig(service: Serving) -> RigBody:
-    """Return the rig: its devices, who holds it, and how many scans wait. Touches no device."""
+    """Return the rig: its devices, its holder, and how many scans wait. Touches no device."""
     status = service.manager.status()
     facts, settings = status.facts, service.manager.rig.settings
     return filled(
@@ -111,7 +111,7 @@ def look_at_rig(service: Serving) -> RigBody:
 
 
 class DeviceList(BaseModel):
-    """What is installed, what is plugged in, and what is missing."""
+    """Installed drivers, connected devices, and missing parts."""
 
     drivers: tuple[InstalledDriver, ...]
     devices: tuple[FoundDevice, ...]
@@ -186,7 +186,7 @@ async def look_through_camera(
         ),
     ] = None,
 ) -> Response:
-    """Look through a camera: an `img` element shows it. Scans go first; pictures wait while one holds the rig."""
+    """Preview of a camera: an `img` element shows it. Scans go first; pictures wait while one holds the rig."""
     held.enter_context(service.streams.take())
     watch = await run_in_threadpool(service.manager.watch, camera, light, exposure_s)
     return StreamingResponse(
@@ -202,12 +202,12 @@ async def _parts(watch: Watch, *, marked: bool) -> AsyncIterator[bytes]:
     with watch:
         while True:
             try:
-                picture = await run_in_threadpool(watch.picture, number, _LOOK_S)
+                picture = await run_in_threadpool(watch.picture, number, _WAIT_S)
             except SlrigError:
-                # The answer has begun: all that is left is to end it. `/rig` tells why.
+                # The answer has begun: all that is left is to end it. `/rig` says why.
                 return
             if picture is None:
-                # An empty line between parts: whoever has gone is noticed by it.
+                # An empty line between parts: it reveals clients that have gone.
                 yield b"\r\n"
                 continue
             number = picture.number
@@ -256,7 +256,7 @@ class ExaminationBody(JobBody):
 
 
 class ExaminationRequest(Strict):
-    """An examination of the rig as it stands, before a still object."""
+    """An examination of the rig in its present state, before a still object."""
 
     if_busy: IfBusy = Field(default="reject", description="while the rig is held: answer 409, or wait in line")
 
@@ -300,7 +300,7 @@ def examine_rig(
     request: Annotated[DoctorRequest, Body(default_factory=DoctorRequest)],
     idempotency_key: IdempotencyKey = None,
 ) -> ExaminationBody:
-    """Examine the rig for faults of light, timing, focus and flicker. The answer comes at once; look again later."""
+    """Examine the rig for faults of light, timing, focus and flicker. The answer comes at once; GET it later."""
     plan = scan_plan(ScanRequest(), service.scan_defaults)
     job = DoctorJob(plan.patterns, service.scan_defaults.exposure_s, request.search_s)
     return _started(service, response, job, request, idempotency_key)
@@ -332,13 +332,13 @@ def check_conformance(
 
 @examination_router.get("/job/{job_id}")
 def look_at_rig_job(service: Serving, job_id: UUID) -> ExaminationBody:
-    """Return an examination: its state, and what was found, or why nothing was."""
+    """Return an examination: its state, and its findings, or why there are none."""
     return _examination(service.store.get(job_id, *RIG_JOBS))
 
 
 @examination_router.post("/job/{job_id}/cancel", status_code=202)
 def cancel_rig_job(service: Serving, job_id: UUID) -> ExaminationBody:
-    """Ask an examination to end early. May be repeated."""
+    """Request the early end of an examination. May be repeated."""
     return _examination(service.manager.cancel(service.store.get(job_id, *RIG_JOBS).id))
 
 
@@ -363,7 +363,7 @@ health_router = APIRouter(prefix="/rig", tags=["health"])
 
 
 class VerificationFigures(BaseModel):
-    """What one verification found."""
+    """Findings of one verification."""
 
     id: UUID
     at: datetime
@@ -420,7 +420,7 @@ class VerificationRequest(Strict):
 
 
 class VerificationBody(BaseModel):
-    """A verification that was asked for."""
+    """A requested verification."""
 
     id: UUID
     state: JobState
@@ -432,7 +432,7 @@ class VerificationBody(BaseModel):
 
 @health_router.get("/health")
 def look_at_health(service: Serving) -> HealthBody:
-    """Return whether the calibration in use still holds, why, and what to do. Touches no device."""
+    """Return whether the calibration in use still holds, the reasons, and the remedy. Touches no device."""
     health, latest, calibration = service.health.health()
     solved = None if calibration is None else calibration.solved
     age_s = None if solved is None else (utc_now() - datetime.fromisoformat(solved.solved_at)).total_seconds()
@@ -478,7 +478,7 @@ def verify_rig(
     request: Annotated[VerificationRequest, Body(default_factory=VerificationRequest)],
     idempotency_key: IdempotencyKey = None,
 ) -> VerificationBody:
-    """Shoot the board and judge the calibration in use by it. The answer comes at once; look again later."""
+    """Shoot the board and judge the calibration in use by it. The answer comes at once; GET it later."""
     board = _board_in_use(service) if request.board is None else request.board.board()
 
     def start(key: str | None) -> UUID:
@@ -494,13 +494,13 @@ def verify_rig(
 
 @health_router.get("/verification/{verification_id}")
 def look_at_verification(service: Serving, verification_id: UUID) -> VerificationBody:
-    """Return a verification: its state, and what was found, or why nothing was."""
+    """Return a verification: its state, and its findings, or why there are none."""
     return _verification(service.store.get(verification_id, JobKind.VERIFICATION))
 
 
 @health_router.post("/verification/{verification_id}/cancel", status_code=202)
 def cancel_verification(service: Serving, verification_id: UUID) -> VerificationBody:
-    """Ask a verification to end early. May be repeated."""
+    """Request the early end of a verification. May be repeated."""
     return _verification(service.manager.cancel(service.store.get(verification_id, JobKind.VERIFICATION).id))
 
 
@@ -529,7 +529,7 @@ _MOST_POSES = 100
 
 
 class TurntableBody(BaseModel):
-    """What is known of the turntable. `document` can be kept, and put back with PUT."""
+    """State of the turntable. `document` can be kept, and put back with PUT."""
 
     state: TurntableState
     own_axis: bool = Field(description="no axis was measured, and the rig's own is used")
@@ -555,11 +555,11 @@ class AxisRequest(Strict):
 
 
 class AxisShootRequest(ExaminationRequest):
-    """The axis from a board that stands on the turntable, which is turned from shot to shot."""
+    """The axis from a board on the turntable, which is turned from shot to shot."""
 
     board: BoardRequest | None = Field(default=None, description="Default: that of the active calibration")
     first_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
-        default=-50.0, description="angle of the first shot, from where the turntable stands when it is opened"
+        default=-50.0, description="angle of the first shot, from the turntable's position when it is opened"
     )
     step_deg: Annotated[float, Field(gt=0, le=180)] = 20.0
     count: Annotated[int, Field(ge=3, le=72)] = Field(
@@ -575,7 +575,7 @@ class PlanesRequest(Strict):
 
 
 class TurntablePose(BaseModel):
-    """A pose of the board. error_deg : of the turntable's angle, null where it was not told."""
+    """A pose of the board. error_deg : of the turntable's angle, null where it is unknown."""
 
     name: str
     residual_mm: float = Field(description="rms distance of the board's corners from where a pure turn puts them")
@@ -584,7 +584,7 @@ class TurntablePose(BaseModel):
 
 
 class AxisBody(TurntableBody):
-    """The axis that was calibrated, and the poses that tell it."""
+    """The calibrated axis, and its poses."""
 
     poses: list[TurntablePose]
 
@@ -603,12 +603,12 @@ def plot_turntable(service: Serving) -> Response:
 
 @turntable_router.post("/turntable/axis", responses=problems(404, 409, 503, 507))
 def calibrate_turntable(service: Serving, request: Annotated[AxisRequest, Body()]) -> AxisBody:
-    """Calibrate the axis from poses of a board that stood on the turntable, by the calibration in use."""
-    seen = observed_boards(service, request.calibration, request.poses)
-    if request.angles_deg is not None and len(request.angles_deg) != len(seen[0]):
-        message = f"angles_deg: expected one for each of {len(seen[0])} poses, found {len(request.angles_deg)}"
+    """Calibrate the axis from poses of a board on the turntable, by the calibration in use."""
+    observed = observed_boards(service, request.calibration, request.poses)
+    if request.angles_deg is not None and len(request.angles_deg) != len(observed[0]):
+        message = f"angles_deg: expected one for each of {len(observed[0])} poses, found {len(request.angles_deg)}"
         raise ConfigError(message)
-    task = Task(turntable_axis, (*seen, request.angles_deg), what="axis of the turntable")
+    task = Task(turntable_axis, (*observed, request.angles_deg), what="axis of the turntable")
     found = service.worker.run(task, within_s=REQUEST_WAIT_S)
     of = str(request.calibration)
     turntable = service.turntable.put_axis(found.axis.measured_axis, source=AxisSource.BOARD, of=of)
@@ -628,8 +628,8 @@ def shoot_axis(
     request: Annotated[AxisShootRequest, Body(default_factory=AxisShootRequest)],
     idempotency_key: IdempotencyKey = None,
 ) -> ExaminationBody:
-    """Shoot a board that stands on the turntable at several angles, and measure the axis, by the calibration in use.
-    The answer comes at once; look again later.
+    """Shoot a board on the turntable at several angles, and measure the axis, by the calibration in use. The answer
+    comes at once; GET it later.
     """
     board = _board_in_use(service) if request.board is None else request.board.board()
     job = AxisJob(board, request.first_deg, request.step_deg, request.count, request.exposure_s)

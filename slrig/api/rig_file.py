@@ -49,14 +49,14 @@ router = APIRouter(prefix="/rig", tags=["rig"])
 
 
 class CameraSettingsEntry(Strict):
-    """How a camera is set where a scan says nothing else."""
+    """Settings of a camera where a scan says nothing else."""
 
     exposure_s: ExposureSeconds | None = Field(default=None, description="null: 1/60 s, or the nearest that it can")
     gain: Gain = 1.0
 
 
 class RigSettings(Strict):
-    """What may be changed of an open rig without knowing its file."""
+    """Settings of an open rig that may be changed without knowing its file."""
 
     cameras: dict[CameraName, CameraSettingsEntry] = Field(
         description=f'by name; those of a head, which holds for all its cameras, as "{HEAD}"'
@@ -95,7 +95,7 @@ class RigFileRequest(Strict):
 
 
 class SettingsRequest(RigSettings):
-    """Settings for the rig file, whose comments stay."""
+    """Settings for the rig file; its comments stay."""
 
     version: str = Field(description="of the one that is changed")
 
@@ -119,7 +119,7 @@ def read_rig_file(service: Serving) -> RigFileBody:
 
 @router.put("/file", responses=problems(409, 429, 502, 503, 507))
 def replace_rig_file(service: Serving, request: Annotated[RigFileRequest, Body()]) -> RigFileBody:
-    """Open the rig by another text of its file, and keep that. The old file lies beside it with the ending .bak. A rig
+    """Open the rig by another text of its file, and keep that. The old file is next to it with the ending .bak. A rig
     that cannot be opened so is opened as before, and nothing is written.
     """
     _change(service, request.text, version=request.version)
@@ -151,7 +151,7 @@ def _change(service: Service, text: str, *, version: str | None) -> None:
     config = rig_of(text, path)
     if config.name != service.rig.name:
         message = (
-            f"name: expected '{service.rig.name}', whose scans lie in this data folder, found '{config.name}'. For "
+            f"name: expected '{service.rig.name}', the rig of this data folder, found '{config.name}'. For "
             "another rig, start a service with a data folder of its own."
         )
         raise ConfigError(message)
@@ -176,7 +176,7 @@ def _change(service: Service, text: str, *, version: str | None) -> None:
 def _replace(path: Path, text: str, *, version: str) -> None:
     old = read_text(path, MAX_CONFIG_BYTES, ConfigError)
     if _version(old) != version:
-        message = f"{path} was changed meanwhile, and is as it is. Look at it again, then change it."
+        message = f"{path} was changed meanwhile, and stays so. Read it again, then change it."
         raise RigFileChangedError(message)
     mode = path.stat().st_mode
     for place, content in ((path.with_name(f"{path.name}.bak"), old), (path, text)):
@@ -219,11 +219,11 @@ def _settings(config: RigConfig) -> RigSettings:
     )
 
 
-def _require_settings(service: Service, config: RigConfig, asked: RigSettings) -> None:
+def _require_settings(service: Service, config: RigConfig, wanted: RigSettings) -> None:
     """Raise RequestValidationError unless the settings are of this rig's cameras, and those can do them."""
     known, faults = _settings(config).cameras, []
     facts = service.manager.rig.facts
-    for name, entry in asked.cameras.items():
+    for name, entry in wanted.cameras.items():
         if name not in known:
             faults.append(_fault(name, (), f"expected one of {', '.join(known)}; there is no such camera", name))
             continue
@@ -232,8 +232,8 @@ def _require_settings(service: Service, config: RigConfig, asked: RigSettings) -
                 continue
             shortest_s, longest_s = info.exposure_range_s
             if entry.exposure_s is not None and not shortest_s <= entry.exposure_s <= longest_s:
-                words = f"expected {shortest_s:g} to {longest_s:g} s, which camera {camera} can"
-                faults.append(_fault(name, ("exposure_s",), words, entry.exposure_s))
+                message = f"expected {shortest_s:g} to {longest_s:g} s, which camera {camera} can"
+                faults.append(_fault(name, ("exposure_s",), message, entry.exposure_s))
             least, most = info.gain_range
             if not least <= entry.gain <= most:
                 faults.append(
@@ -243,23 +243,23 @@ def _require_settings(service: Service, config: RigConfig, asked: RigSettings) -
         raise RequestValidationError(faults)
 
 
-def _fault(name: str, key: tuple[str, ...], words: str, found: object) -> dict[str, Any]:
-    return {"type": "value_error", "loc": ("body", "cameras", name, *key), "msg": words, "input": found}
+def _fault(name: str, key: tuple[str, ...], message: str, found: object) -> dict[str, Any]:
+    return {"type": "value_error", "loc": ("body", "cameras", name, *key), "msg": message, "input": found}
 
 
-def _with_settings(text: str, asked: RigSettings) -> str:
+def _with_settings(text: str, wanted: RigSettings) -> str:
     tables: Any = tomlkit.parse(text)
     was = _settings(rig_of(text, Path("rig.toml")))
-    if any(was.cameras[name].exposure_s != each.exposure_s for name, each in asked.cameras.items()):
+    if any(was.cameras[name].exposure_s != each.exposure_s for name, each in wanted.cameras.items()):
         put_value(tables.get("scan", {}), "exposure_s", None)
-    for name, entry in asked.cameras.items():
+    for name, entry in wanted.cameras.items():
         table = tables["head"] if "head" in tables else next(each for each in tables["camera"] if each["name"] == name)
         put_value(table, "exposure_s", entry.exposure_s)
         if table.get("gain", 1.0) != entry.gain:
             put_value(table, "gain", entry.gain)
     for key, option, value, usual in (
-        ("accuracy", "tolerance_mm", asked.tolerance_mm, None),
-        ("verification", "refuse_when_stale", asked.refuse_when_stale, False),
+        ("accuracy", "tolerance_mm", wanted.tolerance_mm, None),
+        ("verification", "refuse_when_stale", wanted.refuse_when_stale, False),
     ):
         if tables.get(key, {}).get(option, usual) != value:
             table = tables.setdefault(key, tomlkit.table())

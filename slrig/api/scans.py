@@ -40,7 +40,7 @@ from slrig.scan.job import scans_of, series, with_guess
 from slrig.scan.plan import PresetSource
 
 MOST_SCAN_BYTES = 4 * MAX_MASK_CHARACTERS
-"""Of a request: masks of four cameras as long as any may be, or of more as they are."""
+"""Longest request: masks of four cameras as long as any may be, or shorter ones of more."""
 
 router = APIRouter(prefix="/scan", tags=["scan"])
 
@@ -55,8 +55,8 @@ def start_scan(
     """Start a scan. The answer comes at once; follow `links.events` for the rest."""
     preset = None if request.preset is None else service.presets.get(request.preset)
     in_robots_axes = request.reconstruction.mesh_axes is MeshAxes.ROBOT
-    placed = rig_in_base(service, request.robot_pose, needed=in_robots_axes)
-    plan = scan_plan(request, service.scan_defaults, preset, placed)
+    in_base = rig_in_base(service, request.robot_pose, needed=in_robots_axes)
+    plan = scan_plan(request, service.scan_defaults, preset, in_base)
     plan = replace(plan, turn_deg=request.turn_deg, turned_by=request.turned_by)
 
     def start(key: str | None) -> UUID:
@@ -83,7 +83,7 @@ class ScanQuery(BaseModel):
         default=None, description="name of the rig that scanned"
     )
     preset: Annotated[SafeText, Field(max_length=200)] | None = Field(
-        default=None, description="name of the preset that was asked for"
+        default=None, description="name of the requested preset"
     )
     cursor: Cursor = None
     limit: PageLength = 50
@@ -93,22 +93,22 @@ class ScanQuery(BaseModel):
 def list_scans(
     service: Serving,
     response: Response,
-    asked: Annotated[ScanQuery, Query()],
+    query: Annotated[ScanQuery, Query()],
 ) -> ScanPage:
-    """List scans from new to old, all of them or those that are asked for."""
-    wanted = {name: value for name, value in asked if name not in {"cursor", "limit", "state"}}
+    """List scans from new to old, all of them or those that match."""
+    wanted = {name: value for name, value in query if name not in {"cursor", "limit", "state"}}
 
     def found(most: int) -> Sequence[JobRecord]:
-        return service.store.page(JobKind.SCAN, before=asked.cursor, limit=most, states=asked.state, **wanted)
+        return service.store.page(JobKind.SCAN, before=query.cursor, limit=most, states=query.state, **wanted)
 
-    query = asked.model_dump(mode="json", exclude_unset=True, exclude={"cursor", "limit"})
-    shown, following = paged(found, asked.limit, "/scan", service, response, query)
+    kept = query.model_dump(mode="json", exclude_unset=True, exclude={"cursor", "limit"})
+    shown, following = paged(found, query.limit, "/scan", service, response, kept)
     return ScanPage(scans=[_listed(service, record) for record in shown], next=following)
 
 
 @router.get("/{scan_id}")
 def look_at_scan(service: Serving, scan_id: UUID) -> ScanBody:
-    """Return a scan: its state, how far it is, and where its files are."""
+    """Return a scan: its state, its progress, and links to its files."""
     return _body(service, service.store.get(scan_id, JobKind.SCAN))
 
 
@@ -120,7 +120,7 @@ def rename_scan(service: Serving, scan_id: UUID, request: NewName) -> ScanBody:
 
 @router.post("/{scan_id}/cancel", status_code=202)
 def cancel_scan(service: Serving, scan_id: UUID) -> ScanBody:
-    """Ask a scan to stop between two frames. May be repeated; a scan that has finished stays as it is."""
+    """Request a scan to stop between two frames. May be repeated; a scan that has finished stays as it is."""
     return _body(service, service.manager.cancel(service.store.get(scan_id, JobKind.SCAN).id))
 
 
@@ -132,17 +132,17 @@ def look_at_series(service: Serving, series_id: UUID) -> ScanSeries:
 
 @router.post("/series/{series_id}/cancel", status_code=202)
 def cancel_series(service: Serving, series_id: UUID) -> ScanSeries:
-    """Ask all scans of a series to stop. May be repeated; those that have finished stay as they are."""
+    """Request all scans of a series to stop. May be repeated; those that have finished stay as they are."""
     return ScanSeries(scans=[_body(service, record) for record in _cancel_series(service.manager, series_id)])
 
 
 class ReconstructAgain(Strict):
-    """What is to be otherwise when a scan is made anew."""
+    """Changes of a scan's plan for a further reconstruction."""
 
     uncalibrated: UncalibratedRequest | None = Field(
         default=None,
-        description="of a scan that was asked for with guesses: these in place of them, as for another baseline. "
-        "Default: everything as it was",
+        description="of a scan that was requested with guesses: replaces these, as for another baseline. Default: no "
+        "change",
     )
 
 
@@ -150,7 +150,7 @@ class ReconstructAgain(Strict):
 def reconstruct_scan(
     service: Serving, scan_id: UUID, request: Annotated[ReconstructAgain, Body(default_factory=ReconstructAgain)]
 ) -> ScanBody:
-    """Make mesh and files of a finished scan anew from its bundle, as after a failure, damage or an update. Its files
+    """Make mesh and files of a finished scan again from its bundle, as after a failure, damage or an update. Its files
     stay until then. Follow `links.events` for the rest.
     """
     record = service.store.get(scan_id, JobKind.SCAN)
@@ -161,13 +161,13 @@ def reconstruct_scan(
 
 @router.put("/{scan_id}/pin")
 def pin_scan(service: Serving, scan_id: UUID) -> ScanBody:
-    """Keep a scan, whatever the settings say of old ones. DELETE lets it go the way of the others again."""
+    """Keep a scan, also where the settings remove old ones. DELETE ends that."""
     return _body(service, service.store.pin(scan_id, JobKind.SCAN, pinned=True))
 
 
 @router.delete("/{scan_id}/pin")
 def unpin_scan(service: Serving, scan_id: UUID) -> ScanBody:
-    """Let a scan be removed when it is old, where the settings ask for that."""
+    """Remove a scan when it is old, where the settings say so."""
     return _body(service, service.store.pin(scan_id, JobKind.SCAN, pinned=False))
 
 
@@ -198,11 +198,11 @@ def _body(service: Service, record: JobRecord) -> ScanBody:
 
 exposure_router = APIRouter(prefix="/exposure", tags=["scan"])
 
-_SAME = ("preset", "patterns", "coloured_light")  # as in the scan that is going to be asked for
+_SAME = ("preset", "patterns", "coloured_light")  # as in the scan to come
 
 
 class ExposureRequest(Strict):
-    """What the scan is going to be like, as far as it is known."""
+    """Options of the scan to come, as far as they are known."""
 
     budget_s: Annotated[float, Field(gt=0, le=3600)] | None = Field(
         default=None, description="the most that capture may take, seconds. Default: as long as the object needs"
@@ -216,7 +216,7 @@ class CoverBody(BaseModel):
     """One exposure, and shares of the lit pixels."""
 
     exposure_s: float
-    well: float = Field(description="white stands well out of black")
+    well: float = Field(description="white is clearly brighter than black")
     decoded: float = Field(description="clear enough to be decoded, those among them")
     too_dark: float
     saturated: float
@@ -225,11 +225,11 @@ class CoverBody(BaseModel):
 class ExposureBody(BaseModel):
     """A proposal."""
 
-    scan: dict[str, Any] = Field(description="the body of POST /scan that asks for it; keys may be added")
+    scan: dict[str, Any] = Field(description="the body of POST /scan for it; keys may be added")
     exposures: list[CoverBody] = Field(description="those proposed")
     others: list[CoverBody] = Field(description="the others that were considered")
     completeness: float = Field(description="share of the lit pixels that they decode together")
-    well: float = Field(description="share that stands well out of black in one of them at least")
+    well: float = Field(description="share that is clearly brighter in white than in black in one of them at least")
     too_dark: float = Field(description="share that remains too dark")
     saturated: float = Field(description="share that remains saturated")
     lit: float = Field(description="share of the cameras' pixels that the projector lights")
@@ -241,10 +241,10 @@ class ExposureBody(BaseModel):
 def propose_exposures(
     service: Serving, request: Annotated[ExposureRequest, Body(default_factory=ExposureRequest)]
 ) -> ExposureBody:
-    """Look at the object under white and black light for some seconds, and propose exposures for a scan of it."""
+    """Measure the object under white and black light for some seconds, and propose exposures for a scan of it."""
     preset = None if request.preset is None else service.presets.get(request.preset)
-    asked = ScanRequest(**{key: getattr(request, key) for key in _SAME})
-    plan = scan_plan(asked, service.scan_defaults, preset)
+    wanted = ScanRequest(**{key: getattr(request, key) for key in _SAME})
+    plan = scan_plan(wanted, service.scan_defaults, preset)
     found = proposed_exposures(service.manager, plan, budget_s=request.budget_s)
     times_s = [each.exposure_s for each in found.exposures]
     exposing: dict[str, Any] = {"exposure_s": times_s[0]} if len(times_s) == 1 else {"exposures_s": times_s}
@@ -294,5 +294,5 @@ def put_preset(service: Serving, name: Name, document: PresetDocument) -> Preset
 
 @preset_router.delete("/{name}", status_code=204, responses=problems(404))
 def delete_preset(service: Serving, name: Name) -> None:
-    """Delete a preset that was put. A shipped one, or the rig file's, of its name is seen again."""
+    """Delete a stored preset. A shipped one, or the rig file's, of its name is listed again."""
     service.presets.delete(name)

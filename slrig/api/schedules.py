@@ -20,7 +20,7 @@ from slrig.schedule.store import LEAST_RETRY_S, MOST_GRACE_S, Cron, Schedule, Sc
 router = APIRouter(prefix="/schedule", tags=["schedule"])
 
 _UPCOMING = 5
-"""How many of the next due times are shown."""
+"""Number of next due times that are shown."""
 
 
 class ScheduleRequest(Strict):
@@ -31,7 +31,7 @@ class ScheduleRequest(Strict):
         "'30 6 * * mon-fri' is 06:30 on working days"
     )
     time_zone: Annotated[str, Field(min_length=1, max_length=64)] = Field(
-        default="UTC", description="whose clocks: a name of the IANA database, such as Europe/Berlin"
+        default="UTC", description="time zone of the clock: a name of the IANA database, such as Europe/Berlin"
     )
     task: Annotated[TaskKind, Field(strict=False)] = Field(
         description="verification: does the calibration still hold; calibration: every pose of a positioner, then a "
@@ -52,13 +52,13 @@ class ScheduleRequest(Strict):
     enabled: bool = True
 
     def order(self) -> ScheduleSpec:
-        """What is asked for. Raises ScheduleError."""
-        asked = {name: value for name, value in self if name not in {"cron", "time_zone"}}
-        return ScheduleSpec(Cron(self.cron, self.time_zone), **asked)
+        """The requested schedule. Raises ScheduleError."""
+        given = {name: value for name, value in self if name not in {"cron", "time_zone"}}
+        return ScheduleSpec(Cron(self.cron, self.time_zone), **given)
 
 
 class ScheduleLinks(BaseModel):
-    """Where to go from here."""
+    """Links of a schedule."""
 
     self: str
     runs: str
@@ -95,8 +95,8 @@ class ScheduleList(BaseModel):
 
 
 class RunPage(BaseModel):
-    """Runs from new to old, each due as clocks in the schedule's time zone show it. `next` asks for the page after this
-    one, null on the last.
+    """Runs from new to old, each due as clocks in the schedule's time zone show it. `next` is the path of
+    the next page, null on the last.
     """
 
     runs: list[ScheduledRun]
@@ -175,7 +175,7 @@ def run_now(service: Serving, schedule_id: UUID) -> ScheduledRun:
 
 @router.post("/{schedule_id}/pause")
 def pause_schedule(service: Serving, schedule_id: UUID) -> ScheduleBody:
-    """Let nothing become due until it is resumed. A run under way goes on. May be repeated."""
+    """Pause a schedule until it is resumed. A run under way goes on. May be repeated."""
     return _body(service.schedules.enable(schedule_id, enabled=False))
 
 
@@ -189,7 +189,7 @@ def resume_schedule(service: Serving, schedule_id: UUID) -> ScheduleBody:
 
 @router.post("/{schedule_id}/cancel", status_code=202, responses=problems(409))
 def cancel_run(service: Serving, schedule_id: UUID) -> ScheduleBody:
-    """Ask the run that is under way to end early; the schedule stays as it is. May be repeated while it is."""
+    """Request the early end of the run under way; the schedule stays as it is. May be repeated while it is."""
     schedule = service.schedules.get(schedule_id)
     service.tasks.cancel(schedule)
     return _body(schedule)

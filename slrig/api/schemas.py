@@ -1,4 +1,4 @@
-"""What requests may say and what answers hold."""
+"""Bodies of requests and answers."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ from slrig.scan.plan import (
 
 MOST_EXPOSURE_S = 60.0
 MOST_REPEATS = 500
-"""Of one request: more are for a schedule, which outlives what happens to one series."""
+"""Most of one request: more are for a schedule, which outlives the faults of one series."""
 Body = TypeVar("Body", bound=BaseModel)
 
 
@@ -60,7 +60,7 @@ class PatternRequest(Strict):
 
     sequence: Annotated[SequenceName, Field(strict=False)] | None = Field(
         default=None,
-        description="what stands where the options below say nothing: `fast`, fewest frames; `standard`; `robust`, "
+        description="defaults of the options below: `fast`, fewest frames; `standard`; `robust`, "
         "each bit with its inverse, for reflecting and concave objects; `phase`, sinusoids in few frames, "
         "where the projector shows shades of grey. Default standard",
     )
@@ -96,7 +96,7 @@ class PatternRequest(Strict):
     )
     rows: bool | None = Field(
         default=None,
-        description="true: columns and rows. false: columns alone. Default: what the calibration asks for, columns for "
+        description="true: columns and rows. false: columns alone. Default: as the calibration needs, columns for "
         "devices side by side and rows for devices above one another; columns without a calibration",
     )
     cross_lines: bool | None = Field(
@@ -107,7 +107,7 @@ class PatternRequest(Strict):
 
 
 class UncalibratedRequest(Strict):
-    """What is known of the devices of a rig that is not calibrated: the scan itself calibrates it."""
+    """Known facts of the devices of a rig that is not calibrated: the scan itself calibrates it."""
 
     focal_px: dict[CameraName, Annotated[float, Field(gt=0)]] = Field(
         default_factory=dict, description="focal length of cameras by name, px. Default: 1.4 times the image's width"
@@ -138,7 +138,7 @@ class UncalibratedRequest(Strict):
 
 
 class ReconstructionRequest(Strict):
-    """How frames become a mesh. What is absent or null is as the rig file says, and else the default."""
+    """Options of the reconstruction. Absent or null ones are as the rig file says, or else the default."""
 
     keep_holes: bool | None = Field(
         default=None, description="drop triangles that span a gap between two stripes of one code. Default false"
@@ -150,7 +150,7 @@ class ReconstructionRequest(Strict):
     )
     max_code_gap: Annotated[int, Field(ge=1, le=64)] | None = Field(
         default=None,
-        description="stripes whose columns differ by at most this many steps are meshed together. Default 1",
+        description="stripes that differ by at most this many columns are meshed together. Default 1",
     )
     flip_rule: Annotated[FlipRule, Field(strict=False)] | None = Field(
         default=None,
@@ -185,12 +185,12 @@ class ReconstructionRequest(Strict):
 
 
 class ShotRequest(Strict):
-    """How an object is shot. An empty request is as the rig file describes it."""
+    """Options of a scan of an object. An empty request is as the rig file describes it."""
 
     preset: PresetName | None = Field(
         default=None,
-        description="options by name, as GET /preset lists them. What is said beside it stands above it, and it stands "
-        "above the rig file's `[scan]`",
+        description="options by name, as GET /preset lists them. Other options of the request override it; it "
+        "overrides the rig file's `[scan]`",
     )
     patterns: PatternRequest = Field(default_factory=PatternRequest)
     reconstruction: ReconstructionRequest = Field(default_factory=ReconstructionRequest)
@@ -233,7 +233,7 @@ class ScanRequest(ShotRequest):
         "The rig's turntable turns there first, from where it stood when it was opened. Default: nothing is turned",
     )
     turned_by: TurnedBy = Field(
-        default="table", description="hand: somebody has turned the object to turn_deg already, and nothing moves"
+        default="table", description="hand: a person has turned the object to turn_deg already, and nothing moves"
     )
     robot_pose: PoseEntry | None = Field(
         default=None, description="of the flange in the robot's base, 4 x 4, mm, at this scan, where the rig is in hand"
@@ -255,7 +255,7 @@ class ScanRequest(ShotRequest):
     @classmethod
     def _of_a_series(cls, every_s: float | None, info: ValidationInfo) -> float | None:
         if every_s is not None and info.data.get("repeat") == 1:
-            message = "expected repeat above 1 beside it, found none; say how many scans, or leave every_s out"
+            message = "expected repeat above 1 with it, found none; say how many scans, or leave every_s out"
             raise ValueError(message)
         return every_s
 
@@ -275,8 +275,8 @@ def scan_plan(
     """The plan that a request means on a rig with these defaults. preset : the one that the request names.
     rig_in_base : (4, 4), mm, the rig in a robot's base, where it is known.
 
-    The rig file's exposure is no part of it: it is among the settings that each camera was opened with. Its bracket is,
-    unless the request or the preset says how long to expose.
+    The rig file's exposure is not part of it: it is among the settings that each camera was opened with. Its bracket
+    is, unless the request or the preset states an exposure.
 
     >>> scan_plan(ScanRequest(), ScanDefaults(line_shift_period_px=12)).patterns.line_shift_period_px
     12
@@ -302,10 +302,10 @@ def scan_plan(
 
 def pattern_plan(request: PatternRequest, defaults: ScanDefaults) -> PatternPlan:
     """The patterns that a request means on a rig with these defaults. Of those, what is of lines or of sinusoids counts
-    in their own sequences only. Raises ConfigError: the request has options of the one beside a sequence of the other.
+    in their own sequences only. Raises ConfigError: the request has options of one kind with a sequence of the other.
 
-    >>> asked = PatternRequest(sequence="phase", sine_period_px=16)
-    >>> pattern_plan(asked, ScanDefaults(line_width_px=1)) == PatternPlan(sequence="phase", sine_period_px=16)
+    >>> request = PatternRequest(sequence="phase", sine_period_px=16)
+    >>> pattern_plan(request, ScanDefaults(line_width_px=1)) == PatternPlan(sequence="phase", sine_period_px=16)
     True
     """
     chosen = _chosen(PatternPlan, request, defaults)
@@ -317,9 +317,9 @@ def pattern_plan(request: PatternRequest, defaults: ScanDefaults) -> PatternPlan
 def _chosen(plan: type[Any], request: BaseModel, defaults: ScanDefaults) -> dict[str, Any]:
     chosen = {}
     for field in fields(plan):
-        # Not every part of a plan can be asked for in a request, or set in a rig file.
-        asked = getattr(request, field.name, None)
-        value = asked if asked is not None else getattr(defaults, field.name, None)
+        # Not every part of a plan is an option of a request, or of a rig file.
+        given = getattr(request, field.name, None)
+        value = given if given is not None else getattr(defaults, field.name, None)
         if value is not None:
             chosen[field.name] = (
                 value.region() if isinstance(value, RegionTable)
@@ -336,7 +336,7 @@ class NewName(Strict):
 
 
 class ProgressBody(BaseModel):
-    """How far a job is: 0 to 1 of the whole."""
+    """Progress of a job: 0 to 1 of the whole."""
 
     stage: str
     fraction: Annotated[float, AfterValidator(lambda fraction: round(fraction, 4))]
@@ -344,7 +344,7 @@ class ProgressBody(BaseModel):
 
 
 class JobLinks(BaseModel):
-    """Where to go from here. `files` holds those that are ready."""
+    """Links of a job. `files` holds those that are ready."""
 
     self: str
     events: str
@@ -353,13 +353,13 @@ class JobLinks(BaseModel):
 
 
 class ScanLinks(JobLinks):
-    """Where to go from here. `files` holds those that are ready."""
+    """Links of a scan. `files` holds those that are ready."""
 
     series: str | None = Field(description="all scans of the series that this one belongs to; null for one alone")
 
 
 def _shown_fault(fault: object) -> object:
-    """A problem stands for itself: what was sent can be read again."""
+    """A recorded fault as a problem; a problem that was sent can be read again."""
     return fault_problem(fault) if isinstance(fault, JobFailure) else fault
 
 
@@ -377,12 +377,12 @@ Plan = TypeVar("Plan")
 AskedPlan = Annotated[
     Plan | None,
     BeforeValidator(lambda plan: plan or None),
-    Field(description="what was asked; null where its record is damaged"),
+    Field(description="the request; null where its record is damaged"),
 ]
 
 
 class JobFacts(BaseModel):
-    """What every job on record has."""
+    """Fields of every job on record."""
 
     id: UUID
     state: JobState
@@ -399,11 +399,11 @@ class JobBody(JobFacts):
     """A job on record."""
 
     summary: dict[str, Any] | None = Field(description="the plain figures and the notes of report.json")
-    requested_by: str | None = Field(description="the name of the key, or the schedule, that asked for it")
+    requested_by: str | None = Field(description="the name of the key, or the schedule, that requested it")
 
 
 class ListedLinks(BaseModel):
-    """Where to go from a list. `self` has everything else; `picture` is null where there is none yet."""
+    """Links of a listed job. `self` has everything else; `picture` is null where there is none yet."""
 
     self: str
     events: str
@@ -414,7 +414,7 @@ class ListedLinks(BaseModel):
 class ListedJob(JobFacts):
     """A scan or a model in a list."""
 
-    pinned: bool = Field(description="kept, whatever the settings say of old ones")
+    pinned: bool = Field(description="kept, also where the settings remove old ones")
     triangles: int | None = Field(description="of its mesh; null without one")
     sigma_mm: float | None = Field(description="median of the standard deviations of the mesh's points")
     links: ListedLinks
@@ -432,7 +432,7 @@ class ScanBody(JobBody):
 
     plan: AskedPlan[ScanPlan]
     unit: LengthUnit
-    pinned: bool = Field(description="kept, whatever the settings say of old scans")
+    pinned: bool = Field(description="kept, also where the settings remove old scans")
     links: ScanLinks
 
 
@@ -440,7 +440,7 @@ class ListedScan(ListedJob):
     """A scan in a list."""
 
     turn_deg: float | None = Field(description="angle of the turntable; null where nothing was turned")
-    preset: str | None = Field(description="the name of the preset that was asked for; null without one")
+    preset: str | None = Field(description="the name of the requested preset; null without one")
     unit: LengthUnit
 
 
@@ -458,7 +458,7 @@ def listed_links(record: JobRecord, made: Path, picture: str) -> ListedLinks:
 
 
 class ScanPage(BaseModel):
-    """Scans from new to old. `next` asks for the page after this one, null on the last."""
+    """Scans from new to old. `next` is the path of the next page, null on the last."""
 
     scans: list[ListedScan]
     next: str | None
@@ -501,7 +501,7 @@ class CameraBody(BaseModel):
     )
     gain: float | None = Field(description="in use, likewise")
     notes: list[str] = Field(
-        description="what its driver tells of how it runs, and settings that it refused or bent; each with what to do"
+        description="its driver's remarks, and settings that it refused or changed; each with what to do"
     )
 
 
@@ -538,13 +538,13 @@ class RigBody(BaseModel):
     name: str
     open: bool = Field(description="every device is open and was well when last used")
     error: str | None = Field(description="why it is not open; the next scan tries again")
-    opening: str = Field(description="what its driver told last while it is opened; empty where it told nothing")
+    opening: str = Field(description="its driver's latest report while it is opened; empty without one")
     reconstruction: str = Field(description="ok, or how far the process that computes is, or why it cannot compute")
     preparing: bool = Field(description="that process is on its way to ok")
     calibrated: bool | None = Field(description="null before the rig was first open")
     calibration: CalibrationInUse | None = Field(description="what scans use now; null where there is none")
     positions: list[str] = Field(description="poses that the rig's positioner can take; none where a person does")
-    turntable: bool = Field(description="the positioner turns what stands on it to any angle")
+    turntable: bool = Field(description="the positioner turns objects to any angle")
     cameras: list[CameraBody]
     lost_cameras: dict[str, str] = Field(
         description="cameras of the rig file that could not be opened, each with the reason; scans go on without them, "
@@ -565,14 +565,14 @@ class RigBody(BaseModel):
 
 
 class Probe(BaseModel):
-    """The answer of a probe: each thing that was looked at, "ok" or what is wrong or not done yet."""
+    """The answer of a probe: each check, "ok" or what is wrong or not done yet."""
 
     checks: dict[str, str]
     pending: list[str] = Field(default=[], description="checks that are on their way to ok by themselves")
 
 
 class Explanation(BaseModel):
-    """What a kind of problem means."""
+    """Meaning of a kind of problem."""
 
     type: str
     title: str

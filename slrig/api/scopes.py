@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class KeyScope(StrEnum):
-    """What a key is for. Every key may look."""
+    """Permissions of a key. Every key may read."""
 
     LOOK = "look"
     SCAN = "scan"

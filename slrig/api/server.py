@@ -1,5 +1,5 @@
-"""The service as a process: claim the data folder, sweep it, open the port, limit connections, serve until told to
-stop.
+"""The service as a process: claim the data folder, sweep it, open the port, limit connections, serve until it is
+stopped.
 """
 
 from __future__ import annotations
@@ -55,27 +55,27 @@ from slrig.scan.job import PIPELINE, ScanJob
 from slrig.schedule.notices import wanted_kinds
 
 KEPT_DESCRIPTORS = 256
-"""What connections leave to the rig, the records and the worker. A service with a rendered rig has 60 open, each USB
+"""Descriptors reserved for the rig, the records and the worker. A service with a rendered rig has 60 open, each USB
 camera about 10."""
 
 DESCRIPTORS_PER_CONNECTION = 2
 """Its socket, and a file that is sent through it."""
 
 NEWCOMERS = 32
-"""Connections beyond the most that wait for their request to be read while all others are being answered: a probe that
-comes just then is no stranger. They are taken from the kept descriptors."""
+"""Connections beyond the most that wait for their request to be read while all others are being answered: probes that
+come just then are answered. They are taken from the kept descriptors."""
 
 WANTED_DESCRIPTORS = 4096
-"""The soft limit that the service asks for; systems give 1024 unless asked. Enough for the most connections that the
+"""The soft limit that the service requests; systems give 1024 by default. Enough for the most connections that the
 settings allow."""
 
 _ACCEPT_QUIET_S = 60.0
-"""How long nothing more is said of connections that could not be accepted."""
+"""Least interval of messages about connections that could not be accepted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Deadlines:
-    """How long, in seconds, a client may take: to send the head of a request, to send its body, to begin another one,
+    """Time limits of a client, in seconds: to send the head of a request, to send its body, to begin another one,
     and to take what is being sent to it.
     """
 
@@ -86,7 +86,7 @@ class Deadlines:
 
 
 class Room:
-    """How many connections there may be, in all and from one address; this machine itself has no limit of its own.
+    """Limits of connections, in all and from one address; this machine itself has no limit of its own.
 
     Lives on the event loop's thread.
     """
@@ -100,12 +100,12 @@ class Room:
 
     @property
     def open(self) -> int:
-        """How many connections are open."""
+        """Number of open connections."""
         return self._open.total()
 
     def enter(self, newcomer: HttpConnection) -> None:
-        """Let a connection in, and have one make room for it where there is none: itself if nobody else owes anything,
-        and `NEWCOMERS` wait already.
+        """Admit a connection, and close one to make room where there is none: itself if no other one owes anything, and
+        `NEWCOMERS` wait already.
         """
         self._open[newcomer.address] += 1
         self._owing[newcomer] = None
@@ -283,15 +283,15 @@ def raise_descriptor_limit() -> int | None:
 
 
 def listening_socket(host: str, port: int) -> socket.socket:
-    """A socket bound to an address, whose connections send small answers at once: asyncio switches Nagle's delay off
-    only where the protocol is named.
+    """A socket bound to an address, with connections that send small answers at once: asyncio switches Nagle's delay
+    off only where the protocol is named.
     Raises OSError: the address is taken, or not this machine's.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         if sys.platform != "win32":
-            # There it would let two programs listen at one address.
+            # There it would allow two programs to listen at one address.
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
     except BaseException:
@@ -301,7 +301,7 @@ def listening_socket(host: str, port: int) -> socket.socket:
 
 
 def quiet_accepts(loop: asyncio.AbstractEventLoop) -> None:
-    """Have a loop say once a minute, and not for each connection, that it can accept none."""
+    """Limit a loop's message that it can accept no connection to one a minute."""
     last_s = -_ACCEPT_QUIET_S
 
     def handle(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
@@ -321,12 +321,12 @@ KINDS = (
 """Every kind of job that a service runs."""
 
 ADDRESS_FILE = "service.json"
-"""Where in the data folder a running service tells its URL and process id."""
+"""File in the data folder with the URL and process id of a running service."""
 
 _FIRST_KEY_FILE = "first-key"
 
-_TELL_S = 2.5
-"""How often a person is told how far the kernels are."""
+_REPORT_S = 2.5
+"""Interval of messages about the progress of the kernels."""
 
 _log = structlog.get_logger(__name__)
 
@@ -336,7 +336,7 @@ def open_service(
 ) -> Service:
     """Claim the data folder, bring it in order, and return a service that is ready to be started.
 
-    `give_up` is told, on another thread, when the rig file turns out to be wrong as the rig is first opened.
+    `give_up` is called, on another thread, when the rig file turns out to be wrong as the rig is first opened.
 
     Raises
     ------
@@ -391,7 +391,7 @@ def serve(
     until_eof: bool = False,
     say: Callable[[str], None],
 ) -> None:
-    """Serve until SIGTERM, SIGHUP or Ctrl-C. `say` tells a person where the service is and, once, its key.
+    """Serve until SIGTERM, SIGHUP or Ctrl-C. `say` shows a person the service's address and, once, its key.
 
     `until_eof` stops it as well when standard input ends: a service that another program started does not outlive it,
     however that program came to its end.
@@ -407,7 +407,7 @@ def serve(
     """
     set_up_logs(settings.log_level, settings.log_format)
     given = take_secrets()
-    # Whatever is written from now on is for the service's user alone, or may be read by one group.
+    # Files written from now on are for the service's user alone, or may be read by one group.
     os.umask(0o077 if settings.data_group is None else 0o027)
     # uvicorn catches SIGTERM while it serves, ends in good order, and then raises it again: here it must not kill the
     # process before the rest of this function has run.
@@ -443,7 +443,7 @@ def serve(
             key = stack.enter_context(local_key(port))
             if key is not None:
                 ring.admit(key)
-            _tell_keys(ring, app.state.sessions, url, service.folder, fresh=new_key, say=say)
+            _show_keys(ring, app.state.sessions, url, service.folder, fresh=new_key, say=say)
         if not is_loopback(settings.host):
             say("Other machines can reach it. Keys and scans travel unencrypted: put a TLS proxy in front.")
         write_file(address, json.dumps({"url": url, "process_id": os.getpid()}).encode())
@@ -459,7 +459,7 @@ def serve(
         )
         server = _Server(config, service)
         threading.Thread(
-            target=_tell_preparation, args=(service, say, ended), name="slrig-preparation", daemon=True
+            target=_report_preparation, args=(service, say, ended), name="slrig-preparation", daemon=True
         ).start()
         with suppress(KeyboardInterrupt):
             server.run(sockets=[listener])
@@ -474,7 +474,7 @@ def serve(
 
 
 class _Server(uvicorn.Server):
-    """Ends the scans first, while everybody who follows one can still be told, and the connections after that."""
+    """Ends the scans first, while their followers are still connected, and the connections after that."""
 
     def __init__(self, config: uvicorn.Config, service: Service) -> None:
         super().__init__(config)
@@ -499,15 +499,15 @@ class _Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def _tell_preparation(service: Service, say: Callable[[str], None], ended: threading.Event) -> None:
-    """Tell a person every few seconds how far the kernels are, the first time that they are compiled."""
-    told = ""
+def _report_preparation(service: Service, say: Callable[[str], None], ended: threading.Event) -> None:
+    """Report the progress of the kernels to a person, the first time that they are compiled."""
+    reported = ""
     while (status := service.manager.status()).preparing and not status.ending:
-        if status.reconstruction not in {told, LOADING}:
-            told = status.reconstruction
-            say(told)
-        ended.wait(_TELL_S)
-    if told and not status.ending:
+        if status.reconstruction not in {reported, LOADING}:
+            reported = status.reconstruction
+            say(reported)
+        ended.wait(_REPORT_S)
+    if reported and not status.ending:
         say("kernels are ready" if status.reconstruction == READY else status.reconstruction)
 
 
@@ -523,16 +523,16 @@ def take_secrets() -> str | None:
 
 def _keys(settings: ServiceSettings, given: str | None, *, fresh: bool) -> KeyRing:
     if given is not None and fresh:
-        message = f"--new-key asks for a new key, and {KEY_VARIABLE} holds the one to use. Leave out one of the two."
+        message = f"--new-key requests a new key, and {KEY_VARIABLE} holds the one to use. Leave out one of the two."
         raise ConfigError(message)
     return KeyRing(settings.key_path, given=given)
 
 
-def _tell_keys(
+def _show_keys(
     ring: KeyRing, sessions: Sessions, url: str, folder: DataFolder, *, fresh: bool, say: Callable[[str], None]
 ) -> None:
-    """Make the first key, if there is none, and tell a person; what is not a terminal may be kept for years as a log,
-    and is told where the key lies instead.
+    """Make the first key, if there is none, and show it to a person; output that is not a terminal may be kept as a
+    log, and gets the path of a file with the key instead.
     """
     key = first_key(ring, fresh=fresh)
     if sys.stdout.isatty():
@@ -567,7 +567,7 @@ def _terminate() -> None:
 def _listener(settings: ServiceSettings) -> socket.socket:
     try:
         listener = listening_socket(settings.host, settings.port)
-        # From now on a client that was told the address may connect: it is answered once the service is up.
+        # From now on a client that knows the address may connect: it is answered once the service is up.
         listener.listen()
     except OSError as error:
         message = (

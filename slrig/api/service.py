@@ -54,7 +54,7 @@ from slrig.schedule.scheduler import ScanTask, Scheduler, Tasks
 from slrig.schedule.store import ScheduledRun, ScheduleStore
 
 _ANSWER_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
-"""From what a kept-alive request takes on loopback, a millisecond, to where the records give up on a locked file."""
+"""From a kept-alive request on loopback, a millisecond, to the time at which the records give up on a locked file."""
 
 _JOB_S = (1.0, 2.5, 5.0, 10.0, 20.0, 40.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0)
 """From a verification of a few frames to a bracketed scan of large cameras that waits in line behind others."""
@@ -67,7 +67,7 @@ _OTHER = "other"
 
 
 class Durations:
-    """What this process measured since its start. Any thread may call."""
+    """Measurements of this process since its start. Any thread may call."""
 
     def __init__(self) -> None:
         # Of its own: several services in one process, as in tests, do not meet in it.
@@ -75,7 +75,7 @@ class Durations:
         self._answers = Histogram(
             "slrig_http_response_start_seconds",
             "From a request to the head of its answer, by method, path as documented, and class of status. `other`: no "
-            "documented method or path, or refused before the path was looked at.",
+            "documented method or path, or refused before the path was checked.",
             ("method", "path", "status"), buckets=_ANSWER_S, registry=self.registry,
         )  # fmt: skip
         self._jobs = Histogram(
@@ -104,7 +104,7 @@ class Durations:
 
 
 class Latency:
-    """Middleware that measures until the answer begins: a stream is no hour of waiting."""
+    """Middleware that measures until the answer begins: a stream does not count as an hour of waiting."""
 
     def __init__(self, app: ASGIApp, *, durations: Durations) -> None:
         self._app = app
@@ -132,7 +132,7 @@ class Latency:
         try:
             await self._app(scope, receive, measured)
         except Exception:
-            # Whatever is outside of this makes a 500 of it.
+            # Outer middleware makes a 500 of it.
             if not started:
                 note(500)
             raise
@@ -154,13 +154,13 @@ hundred megabytes.
 """
 
 _SCHEDULE_END_S = 1.0
-"""How long a scheduled run may take to end by itself before the runner ends it."""
+"""Time for a scheduled run to end by itself before the runner ends it."""
 
 
 class Service:
-    """One service: its settings, its jobs, what these belong to, and the schedule.
+    """One service: its settings, its jobs and their groups, and the schedule.
 
-    Until `start` nothing works. followed : what streams follow, see `slrig.api.events.told`. rig : its rig file.
+    Until `start` nothing works. followed : see `slrig.api.events.event_stream`. rig : its rig file.
 
     Raises
     ------
@@ -179,16 +179,16 @@ class Service:
         self.store, self.folder, self.worker = manager.store, manager.data, manager.worker
         self.hurry = threading.Event()
         self.devices = DeviceSearch()
-        close = "Close one, or ask for single answers instead, as GET /scan/ID."
+        close = "Close one, or request single answers instead, as GET /scan/ID."
         self.streams = Shares("streams of events, pictures and bundles", settings.max_event_streams, close)
         self.followed: dict[UUID, Any] = {}
         self.requests = Shares(
-            "places for requests", MOST_REQUESTS, "Wait for answers before you ask for more.", retry_s=1, at_once=8
+            "places for requests", MOST_REQUESTS, "Wait for answers before you request more.", retry_s=1, at_once=8
         )
-        again, makings = "Ask again.", "places for what is made on request"
+        again, makings = "Try again.", "places for what is made on request"
         self.makings = Makings(Shares(makings, MOST_MAKINGS, again, status=503))
         self.clouds = Makings(Shares(f"{makings} by the worker", MOST_MAKINGS, again, status=503))
-        # There are three, each made once for all: nobody is refused.
+        # There are three, each made once for all: none is refused.
         self.probes = Makings(Shares("probes", 6, again, status=503, at_once=3))
         self._lasting: frozenset[str] = frozenset()
         database, outbox = self.store.database, self.store.outbox
@@ -222,7 +222,7 @@ class Service:
         self.shooting.take_up()
         self.store.after_end = self._ended
         self.copier = self._copier()
-        self._tellers = (self.receivers, *(() if self.copier is None else (self.copier,)))
+        self._senders = (self.receivers, *(() if self.copier is None else (self.copier,)))
         self.retention = Retention(
             self.folder.root,
             [
@@ -252,7 +252,7 @@ class Service:
         self.scheduler = Scheduler(self.schedules, self.tasks, alone=True)
 
     def use(self, rig: RigConfig) -> None:
-        """Have what is begun from now on go by a rig file: usual options of scans, presets, tolerance."""
+        """Use a rig file for work begun from now on: usual options of scans, presets, tolerance."""
         self.rig = rig
         self.scan_defaults, self.refuse_when_stale = rig.scan, rig.refuse_when_stale
         self.presets = Presets(self.folder.root / "presets", rig.presets)
@@ -266,7 +266,7 @@ class Service:
         self.manager.delete(scan_id, self.models.unused(scan_id))
 
     def rename(self, job_id: UUID, kind: JobKind, label: str | None) -> JobRecord:
-        """Give a job another label, on record and beside its files. Raises JobNotFoundError, StorageError."""
+        """Give a job another label, on record and next to its files. Raises JobNotFoundError, StorageError."""
         place = self.manager.kinds[kind].place_of(self.store.get(job_id, kind), self.folder)
         keep = partial(self.folder.relabel, job_id, place, label)
         with self.folder.naming:
@@ -280,7 +280,7 @@ class Service:
         require_healthy(self.health.health()[0], refuse_when_stale=self.refuse_when_stale)
 
     def _copier(self) -> Copier | None:
-        """What tells the catalogue of this rig, if the settings name one. Raises ConfigError, ExtraMissingError."""
+        """The copier to the catalogue, if the settings name one. Raises ConfigError, ExtraMissingError."""
         catalogue, copies = catalogue_of(self.settings), self.store.outbox.copies
         if catalogue is None or copies is None:
             return None
@@ -297,7 +297,7 @@ class Service:
                 self.store.prune(record.kind, _MOST_ON_RECORD)
             events = self.store.events(record.id, after=0)
             self.durations.ended(record, events)
-        except Exception:  # noqa: BLE001 - the job is over, and on record, whatever becomes of its figures
+        except Exception:  # noqa: BLE001 - the job is over, and on record, also without its figures
             _log.exception("how long a job took could not be noted", job=str(record.id))
             return
         for observer in self.observers:
@@ -305,23 +305,23 @@ class Service:
                 observer.ended(record, events)
 
     def start(self) -> None:
-        """Open the rig, look at the clock, send what waits, and remove what is old."""
-        for sender in self._tellers:
+        """Open the rig, run schedules, send what waits, and remove what is old."""
+        for sender in self._senders:
             sender.start()
         self.manager.start()
         self.scheduler.start()
         self.retention.start()
         self._lasting = _lasting_threads()
 
-    def dead_threads(self) -> list[str]:
+    def ended_threads(self) -> list[str]:
         """Names of threads that have ended, and should last as long as the service."""
-        alive = _lasting_threads()
+        running = _lasting_threads()
         # One of a webhook that was set meanwhile is new.
-        self._lasting |= alive
-        return [] if self.manager.ending else sorted(self._lasting - alive)
+        self._lasting |= running
+        return [] if self.manager.ending else sorted(self._lasting - running)
 
     def drain(self) -> None:
-        """Begin nothing new, and let what has the rig come to its end, as long as the settings allow, or until
+        """Begin nothing new, and wait for the end of the job with the rig, as long as the settings allow, or until
         `hurry`.
         """
         self.manager.drain(self.settings.drain_s, self.hurry)
@@ -338,9 +338,9 @@ class Service:
         self.store.end()
 
     def close(self) -> None:
-        """Stop scanning, then let records and data folder go. Idempotent."""
+        """Stop scanning, then release records and data folder. Idempotent."""
         self.end_work()
-        for sender in self._tellers:
+        for sender in self._senders:
             sender.close()
         for observer in self.observers:
             with _logged(observer):
@@ -351,7 +351,7 @@ class Service:
 
 @contextmanager
 def _logged(observer: object) -> Iterator[None]:
-    """Log whatever an observer raises within the block: it is somebody else's, and only looks."""
+    """Log every error of an observer within the block: it is foreign code, and only observes."""
     try:
         yield
     except BaseException:  # noqa: BLE001 - see above
@@ -369,7 +369,7 @@ async def _of_request(request: Request) -> Service:
 
 
 async def turn(request: Request) -> AsyncIterator[None]:
-    """Has a request wait for its turn among those of its key; what needs no key, or ends work, waits for nobody."""
+    """Make a request wait for its turn among those of its key, except one that needs no key or cancels work."""
     if request.state.caller is None or request.url.path.endswith("/cancel"):
         yield
         return
@@ -386,7 +386,7 @@ Serving = Annotated[Service, Depends(_whole)]
 """A handler's parameter: the service that it serves. Without its data folder it serves nothing: 503."""
 
 Probed = Annotated[Service, Depends(_of_request)]
-"""The service whatever has become of its data folder, for what tells about that."""
+"""The service even without its data folder, for routes that report that."""
 
 Cursor = Annotated[int | None, Query(ge=1, le=2**53, description="`next` of the page before")]
 PageLength = Annotated[int, Query(ge=1, le=200)]
@@ -403,8 +403,8 @@ def paged(
 ) -> tuple[Sequence[Shown], str | None]:
     """The records of a page, and the path of the page after it, which the header `Link` names, too.
 
-    found : gives so many records, from new to old. limit : the most that is asked for; the settings may allow less.
-    query : what else was asked for, which the next page is to be of, too.
+    found : gives so many records, from new to old. limit : the most that is requested; the settings may allow less.
+    query : other parameters of the request, which the next page keeps.
     """
     limit = min(limit, service.settings.page_limit)
     records = found(limit + 1)
@@ -435,7 +435,7 @@ def once(
     request: BaseModel,
     start: Callable[[str | None], UUID],
 ) -> UUID:
-    """The id of what a request makes, or made before with this key.
+    """The id of the result of a request, or of an earlier one with this key.
 
     path : where the request was sent; the same key may be sent elsewhere. start : makes it, and ties it to the key that
     it is given; what it raises leaves the key free.
@@ -484,5 +484,5 @@ def own_key(key: str, path: str) -> str:
 
 
 def fingerprint(request: BaseModel) -> str:
-    """What tells two requests with one idempotency key apart: equal for equal requests, however they were written."""
+    """Distinguishes two requests with one idempotency key: equal for equal requests, in any notation."""
     return hashlib.sha256(request.model_dump_json().encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""Shares of what requests take from one another, and what is made once for all who ask for the same."""
+"""Shares of limited resources among requests, and results made once for all requests of the same."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class Shares:
             return
         detail = (
             f"{who} has {taken[who]} of {self._total} {self._what}, others have {taken.total() - taken[who]}, and "
-            f"nobody gets more than are left for all others. {self._remedy}"
+            f"no one gets more than are left for all others. {self._remedy}"
         )
         raise HTTPException(self._status, detail, headers={"Retry-After": str(self._retry_s)})
 
     @contextmanager
     def take(self) -> Iterator[None]:
-        """Have a place within the block, for whoever asks now. Raises HTTPException: there is none."""
+        """Hold a place within the block for the current caller. Raises HTTPException: there is none."""
         who = actor() or ANYONE
         self.require(who, self.taken)
         self.taken[who] += 1
@@ -56,15 +56,15 @@ class Shares:
 
     @asynccontextmanager
     async def turn(self) -> AsyncIterator[None]:
-        """Have a place, and wait in it, on no thread, for the turn. Raises HTTPException: there is none."""
+        """Hold a place, and wait in it, on no thread, for the turn. Raises HTTPException: there is none."""
         with self.take():
             async with self._turns[actor() or ANYONE]:
                 yield
 
 
 class Makings:
-    """What is made on request, on a thread, once for all who ask for the same meanwhile. Lives on the event loop's
-    thread. shares : of those who make something; who only waits for it needs none.
+    """Results made on request, on a thread, once for all concurrent requests of the same. Lives on the event loop's
+    thread. shares : of requests that make something; those that only wait need none.
     """
 
     def __init__(self, shares: Shares) -> None:
@@ -72,13 +72,13 @@ class Makings:
         self._makings: dict[Hashable, asyncio.Future[Any]] = {}
 
     async def of(self, what: Hashable, make: Callable[[], _Made], *, fresh_s: float = 0.0) -> _Made:
-        """What `make` returns, or another call of it for the same, which is under way or ended well just before.
+        """The result of `make`, or of another call of it for the same that is under way or has just succeeded.
 
-        Raises what that raises, and HTTPException: there is no place to make it.
+        Raises its errors, and HTTPException: there is no place to make it.
         """
         if what not in self._makings:
             self._makings[what] = asyncio.ensure_future(self._make(what, make, fresh_s))
-        # One who goes away ends it for nobody else.
+        # A client that leaves does not end it for others.
         made: _Made = await asyncio.shield(self._makings[what])
         return made
 

@@ -41,7 +41,7 @@ from slrig.jobs.store import AuditEntry
 from slrig.schedule.store import RunState, TaskKind
 
 _FRESH_S = 1.0
-"""For how long probes and figures are those of the one who asked before: everybody may, as often as they like."""
+"""Time for which probes and figures of the previous request are repeated: requests of them are not limited."""
 
 router = APIRouter(tags=["system"])
 
@@ -67,7 +67,7 @@ def _figures(service: Service) -> bytes:
 
 
 class _Figures(Collector):
-    """What a service says of itself now, by its records."""
+    """Current figures of a service, by its records."""
 
     def __init__(self, service: Service) -> None:
         self._service = service
@@ -79,7 +79,7 @@ class _Figures(Collector):
         for state in JobState:
             scans.add_metric([state], states[state])
         yield scans
-        damaged = GaugeMetricFamily("slrig_damaged_jobs", "Jobs whose record or files are damaged.", labels=["kind"])
+        damaged = GaugeMetricFamily("slrig_damaged_jobs", "Jobs with damaged record or files.", labels=["kind"])
         for kind, count in self._service.store.damaged().items():
             damaged.add_metric([kind], count)
         yield damaged
@@ -130,7 +130,7 @@ class _Figures(Collector):
         if self._service.copier is None:
             return
         found = self._service.copier.status()
-        yield GaugeMetricFamily("slrig_catalogue_reached", "1 while the catalogue is told.", float(found.fault is None))
+        yield GaugeMetricFamily("slrig_catalogue_reached", "1 while it is reached.", float(found.fault is None))
         yield GaugeMetricFamily("slrig_catalogue_waiting", "Ended jobs that are not copied yet.", found.waiting)
         yield GaugeMetricFamily(
             "slrig_catalogue_oldest_age_seconds", "How long the oldest of them has waited.", found.oldest_s
@@ -158,7 +158,7 @@ class _Figures(Collector):
 
 
 class ServiceBody(BaseModel):
-    """The service's version, its disk, and what is damaged in its data folder."""
+    """The service's version, its disk, and the damage in its data folder."""
 
     version: str
     python: str
@@ -168,7 +168,7 @@ class ServiceBody(BaseModel):
     checks: dict[str, str] = Field(description="what a scan needs, each ok or its fault, as GET /readyz has it")
     pending: list[str] = Field(description="which of them are not ready yet and get there by themselves")
     spare_bytes: int = Field(description="below so much free space nothing new is begun")
-    damaged: dict[JobKind, int] = Field(description="jobs whose record or files are damaged, by kind")
+    damaged: dict[JobKind, int] = Field(description="jobs with a damaged record or damaged files, by kind")
 
 
 @router.get("/service")
@@ -191,17 +191,17 @@ def look_at_service(service: Serving) -> ServiceBody:
 
 @router.get("/livez", openapi_extra={"security": []})
 async def livez() -> Probe:
-    """Tell that the process answers."""
+    """Show that the process answers."""
     return Probe(checks={"process": "ok"})
 
 
 @router.get("/readyz", response_model=Probe, responses=problems(503), openapi_extra={"security": []})
 async def readyz(service: Probed) -> Response | Probe:
-    """Tell whether a scan could start and end well: records, disk, rig, reconstruction. Touches no device.
+    """Show whether a scan could start and end well: records, disk, rig, reconstruction. Touches no device.
 
     A rig that is held is well. `pending` names what is not ready yet and gets there by itself: the rig while it is
-    opened, the reconstruction until its process has loaded its kernels, which the first time takes a minute. What was
-    found stands for a second.
+    opened, the reconstruction until its process has loaded its kernels, which the first time takes a minute. The answer
+    is valid for a second.
     """
     return await service.probes.of("ready", partial(_ready, service), fresh_s=_FRESH_S)
 
@@ -216,14 +216,14 @@ def _ready(service: Service) -> Response | Probe:
 
 
 def _checks(service: Service) -> tuple[dict[str, str], list[str]]:
-    """What a scan needs, and which of that gets ready by itself."""
+    """Checks of a scan's needs, and those that get ready by themselves."""
     status = service.manager.status()
     checks = {
         "records": _storage(service.store.check),
         "disk": _storage(lambda: service.folder.require_space(service.settings.min_free_bytes)),
         "rig": _rig(status),
         "reconstruction": status.reconstruction,
-        "threads": _threads(service.dead_threads()),
+        "threads": _threads(service.ended_threads()),
     }
     opening = status.facts is None and status.fault is None and not status.ending
     return checks, [name for name, waits in (("rig", opening), ("reconstruction", status.preparing)) if waits]
@@ -244,7 +244,7 @@ def explain_problem(name: Annotated[str, PathParameter(max_length=64)]) -> Expla
     """Explain a kind of problem: what `type` in an error leads to."""
     text = explanations().get(name)
     if text is None:
-        detail = f"There is no kind of problem '{name}'."
+        detail = f"There is no problem of kind '{name}'."
         raise HTTPException(404, detail)
     return Explanation(type=f"/problems/{name}", title=title_of(name), description=text)
 
@@ -257,8 +257,8 @@ def _storage(check: Callable[[], None]) -> str:
     return "ok"
 
 
-def _threads(dead: Sequence[str]) -> str:
-    return f"{', '.join(dead)} ended by a defect: restart the service, and report its log" if dead else "ok"
+def _threads(ended: Sequence[str]) -> str:
+    return f"{', '.join(ended)} ended by a defect: restart the service, and report its log" if ended else "ok"
 
 
 def _rig(status: RigStatus) -> str:
@@ -272,7 +272,7 @@ def _rig(status: RigStatus) -> str:
 
 
 class AuditPage(BaseModel):
-    """Entries from new to old. `next` asks for the page after this one, null on the last."""
+    """Entries from new to old. `next` is the path of the next page, null on the last."""
 
     entries: list[AuditEntry]
     next: str | None
@@ -314,9 +314,9 @@ page_router = APIRouter(include_in_schema=False)
 
 
 def policy(html: str) -> str:
-    """What a page of ours may load: what comes from here, and those scripts within it that are there now.
+    """Content policy of a page of ours: files from here, and its present inline scripts.
 
-    An import map has to stand within a page: browsers take none from a file.
+    An import map has to be inline: browsers take none from a file.
     """
     digests = (hashlib.sha256(script.encode()).digest() for script in _INLINE.findall(html))
     scripts = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
@@ -333,7 +333,7 @@ def show_page() -> Response:
 
 
 class _Checked(StaticFiles):
-    """Files that a browser keeps, and asks after at each visit: with a new service the page is a new one, too."""
+    """Files that a browser keeps, and revalidates at each visit: a new service has a new page, too."""
 
     def file_response(self, *args: Any, **options: Any) -> Response:
         """See `StaticFiles.file_response`."""
@@ -343,6 +343,6 @@ class _Checked(StaticFiles):
 
 
 def page_files() -> ASGIApp:
-    """What the page loads, packed for the way."""
+    """Files of the page, compressed."""
     # Smaller ones fit one packet as they are.
     return GZipMiddleware(_Checked(directory=FOLDER), minimum_size=1400)

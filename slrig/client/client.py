@@ -54,7 +54,7 @@ _HEIGHT_PX = 420
 
 
 def shown(scan: Mapping[str, Any], coarse: bytes | None) -> str:
-    """HTML of a finished scan. coarse : coarse.glb, where it is at hand."""
+    """HTML of a finished scan. coarse : coarse.glb, where it is available."""
     rows = "".join(
         f"<tr><th style='text-align:left'>{escape(name)}</th><td style='text-align:left'>{escape(value)}</td></tr>"
         for name, value in _facts(scan)
@@ -123,7 +123,7 @@ class Cloud:
 
     @cached_property
     def albedo(self) -> Floats:
-        """(H, W, 3) float32: `colour` as light, 0 to 1 (IEC 61966-2-1), NaN where there is no point."""
+        """(H, W, 3) float32: `colour` as light, 0 to 1 (IEC 61966-2-1), NaN without a point."""
         import numpy as np
 
         value = np.arange(256) / 255
@@ -334,7 +334,7 @@ class Client:
     Raises
     ------
     ConfigError
-        The address is no URL, or the key holds a character that no key has.
+        The address is not a URL, or the key holds a character that no key has.
     """
 
     def __init__(
@@ -516,7 +516,7 @@ class Client:
         return target
 
     def follow(self, link: str) -> Iterator[Event]:
-        """The events of the job whose `events` link this is, until it is done."""
+        """The events of a job, by its `events` link, until it is done."""
         return self.connection.follow(link)
 
     def __enter__(self) -> Self:

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Event:
-    """Something that happened. number : rises from event to event. job : whose it is, where all jobs are followed. Of a
-    kind that this client does not know, no more is told.
+    """An event. number : rises from event to event. job : its id, where all jobs are followed. An event of a kind that
+    this client does not know has no more.
     """
 
     number: int
@@ -40,7 +40,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Progress(Event):
-    """How far a job is. fraction : 0 to 1 of the whole. pose : of a calibration, its number."""
+    """Progress of a job. fraction : 0 to 1 of the whole. pose : of a calibration, its number."""
 
     stage: str = ""
     fraction: float = 0.0
@@ -58,7 +58,7 @@ class StateChange(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Captured(Event):
-    """The rig is free of the job, whose frames are computed with from now on. pose : of a calibration, its number."""
+    """The rig is free of the job; its frames are reconstructed from now on. pose : of a calibration, its number."""
 
     pose: int | None = None
 
@@ -101,7 +101,7 @@ def event_of(number: int, kind: str, data: Mapping[str, Any]) -> Event:
 
 URL = "http://127.0.0.1:8731"
 PATIENCE_S = 30.0
-"""How long a connection that broke is tried again before the service counts as gone."""
+"""Time in which a broken connection is tried again before the service counts as gone."""
 
 _LOCAL = frozenset({"localhost", "127.0.0.1", "::1"})
 _RETRY_S = 0.5
@@ -122,7 +122,7 @@ class Connection:
     Raises
     ------
     ConfigError
-        The address is no URL, or the key holds a character that no key has.
+        The address is not a URL, or the key holds a character that no key has.
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class Connection:
         return decode_picture(self.send("GET", path, **request).content)
 
     def follow(self, path: str, *, after: int | None = 0, **request: Any) -> Iterator[Event]:
-        """Yield the events of a job, from the first to the last, whatever happens to the connection.
+        """Yield the events of a job, from the first to the last, also across broken connections.
 
         after : number of the event to begin after; None: as the request says.
 
@@ -256,8 +256,8 @@ class Connection:
             response.close()
 
     def _send(self, request: httpx2.Request, *, stream: bool = False) -> httpx2.Response:
-        """The answer to a request. A service that says when to ask again, because it has no time to make a file now, is
-        asked again for some minutes.
+        """The answer to a request. Where the service has no time to make a file now and says when to try again, the
+        request is repeated for some minutes.
         """
         tries = _BUSY_TRIES if request.method in {"GET", "HEAD"} else 1
         while True:
@@ -318,13 +318,13 @@ def decode_picture(encoded: bytes) -> Picture:
 
     found = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     if found is None:
-        message = f"{len(encoded)} bytes came that are no picture"
+        message = f"{len(encoded)} bytes came that are not a picture"
         raise ValueError(message)
     return found if found.ndim == 2 else np.ascontiguousarray(found[..., ::-1])
 
 
 def _parts(pieces: Iterator[bytes]) -> Iterator[bytes]:
-    """The bodies of a multipart stream whose parts state their lengths."""
+    """The bodies of a multipart stream with parts that state their lengths."""
     waiting = b""
     for piece in pieces:
         waiting += piece
@@ -332,7 +332,7 @@ def _parts(pieces: Iterator[bytes]) -> Iterator[bytes]:
             stated = [line for line in waiting[:end].lower().splitlines() if line.startswith(_LENGTH)]
             start = end + len(_HEAD_END)
             if not stated:
-                # Empty lines, which keep the connection alive.
+                # Empty lines, which keep the connection open.
                 waiting = waiting[end + 2 :]
                 continue
             length = int(stated[-1].removeprefix(_LENGTH))
@@ -371,5 +371,5 @@ def _http(url: str | None, key: str | None, transport: httpx2.BaseTransport | No
         timeout = httpx2.Timeout(30, read=60)
         return httpx2.Client(base_url=url, headers=headers, timeout=timeout, trust_env=elsewhere, transport=transport)
     except (httpx2.InvalidURL, ValueError) as error:
-        message = f"'{url}' is no URL of a service: {error}. Write it as http://127.0.0.1:8731."
+        message = f"'{url}' is not a URL of a service: {error}. Write it as http://127.0.0.1:8731."
         raise ConfigError(message) from error

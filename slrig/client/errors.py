@@ -1,4 +1,4 @@
-"""What a client raises: the service's problems (RFC 9457) as exceptions. All are ServiceErrors."""
+"""Exceptions of a client: the service's problems (RFC 9457). All are ServiceErrors."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ class UnreachableError(ServiceError):
 
 
 class ForeignAnswerError(ServiceError):
-    """What answers is no slrig service."""
+    """The server is not a slrig service."""
 
 
 class RefusedError(ServiceError):
-    """The service refused, or what it was asked for failed.
+    """The service refused a request, or its work failed.
 
     code : the problem's name, such as "rig-busy"; GET /problems/NAME explains it. status : of HTTP. detail : the
-    problem in words. fields : of an invalid request, each fault as {"field", "message", "found"}. problem : the whole
-    document, with `holder` and `since` where the rig is held. retry_after_s : when to ask again, if it says so.
+    problem as text. fields : of an invalid request, each fault as {"field", "message", "found"}. problem : the whole
+    document, with `holder` and `since` where the rig is held. retry_after_s : when to try again, if it says so.
     """
 
     code: str  # type: ignore[misc] # of the service's error, not of this class
@@ -50,7 +50,7 @@ class NotFoundError(RefusedError):
 
 
 class ConflictError(RefusedError):
-    """The rig is held (code "rig-busy"), or what was asked for does not go with the state of something."""
+    """The rig is held (code "rig-busy"), or the request conflicts with the state of its subject."""
 
 
 class InvalidRequestError(RefusedError):
@@ -58,7 +58,7 @@ class InvalidRequestError(RefusedError):
 
 
 class TooManyError(RefusedError):
-    """As many wait, or ask, as may: `retry_after_s` says when to try again."""
+    """Too many jobs wait, or too many requests came: `retry_after_s` says when to try again."""
 
 
 class ScanFailedError(RefusedError):
@@ -99,10 +99,10 @@ _KINDS = {
 
 
 def refusal(response: httpx2.Response) -> ServiceError:
-    """What an answer of a status from 400 on means. Its body has been read."""
+    """The error of an answer with a status from 400 on. Its body has been read."""
     status = response.status_code
     wait = response.headers.get("Retry-After", "")
-    # Words for both who type `slrig` and who write Python.
+    # For users of both the command line and Python.
     hint = f"Set {KEY_VARIABLE}, or name its file with --key-file." if status == 401 else ""
     try:
         problem = {"status": status, **response.json()}
@@ -113,7 +113,7 @@ def refusal(response: httpx2.Response) -> ServiceError:
 
 
 def foreign(response: httpx2.Response, hint: str = "") -> ForeignAnswerError:
-    """What an answer means that is not as slrig answers."""
+    """The error of an answer that is not like slrig's."""
     message = (
         f"{response.request.url} answered {response.status_code} {response.reason_phrase}, and not as slrig does. "
         "Is another program listening there? Name the service with --url."

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _HEAD = struct.Struct("<II")
-_MOST_BYTES = 1 << 28  # of one message: what is longer is no stream of depth
+_MOST_BYTES = 1 << 28  # of one message: longer ones are not of a stream of depth
 _LEAST_SIGMA_MM, _SIGMA_RATIO = 1e-4, 1.05
 
 
@@ -69,7 +69,7 @@ class Live(Resource):
         return self._connection.json("POST", "/live", json=options)
 
     def status(self) -> Json:
-        """What there is: `depth_per_s`, `viewers`, `facts` of the newest image."""
+        """State of live depth: `depth_per_s`, `viewers`, `facts` of the newest image."""
         return self._connection.json("GET", "/live")
 
     def end(self) -> None:
@@ -117,7 +117,7 @@ def read_recording(path: Path) -> Iterator[LiveFrame]:
 
 
 def split_messages(pieces: Iterable[bytes]) -> Iterator[tuple[dict[str, Any], bytes]]:
-    """Heads and bodies of a stream that comes in pieces. Raises ValueError: it is no such stream, or was cut."""
+    """Heads and bodies of a stream that comes in pieces. Raises ValueError: it is another stream, or was cut."""
     waiting = bytearray()
     for piece in pieces:
         waiting += piece

@@ -16,7 +16,7 @@ ProgressCallback: TypeAlias = Callable[[str, float, str], object]
 """Called with the stage of a job, 0 to 1 of the whole, and a detail."""
 Position: TypeAlias = int | str
 Poses: TypeAlias = Literal["turntable", "markers", "unknown"] | Sequence[Sequence[Sequence[float]]]
-"""How the poses of a model's scans are found; or the poses themselves, 4 x 4 each, in mm."""
+"""Source of the poses of a model's scans; or the poses themselves, 4 x 4 each, in mm."""
 
 
 class ScanFields(TypedDict, total=False):
@@ -78,8 +78,8 @@ class Scans(Resource):
         name : part of the name, upper or lower case, or the start of the id. state : one of these. since, until :
         when they were created, ISO 8601 with the offset from UTC; the latter is excluded. rig, preset : by their names.
         """
-        asked = given(name=name, state=state, since=since, until=until, rig=rig, preset=preset)
-        return self._connection.json("GET", "/scan", params={**asked, **given(cursor=cursor, limit=limit)})
+        filters = given(name=name, state=state, since=since, until=until, rig=rig, preset=preset)
+        return self._connection.json("GET", "/scan", params={**filters, **given(cursor=cursor, limit=limit)})
 
     def files(self, scan_ids: Sequence[str], file: str | None = None) -> bytes:
         """A zip of one file of each of several scans, 50 at most. file : its name; "mesh.ply" by default."""
@@ -102,7 +102,7 @@ class Scans(Resource):
         return self._connection.json("POST", path("/scan/{}/cancel", scan_id))
 
     def reconstruct(self, scan_id: str, *, uncalibrated: Mapping[str, Any] | None = None) -> Json:
-        """Make mesh and files of a finished scan anew from its bundle; `Client.job` follows it. uncalibrated : other
+        """Make mesh and files of a finished scan again from its bundle; `Client.job` follows it. uncalibrated : other
         guesses of a rig without a calibration, such as {"baseline_mm": 180}.
         """
         options = given(uncalibrated=uncalibrated)
@@ -113,7 +113,7 @@ class Scans(Resource):
         return self._connection.json("PUT", path("/scan/{}/pin", scan_id))
 
     def unpin(self, scan_id: str) -> Json:
-        """Let the settings delete a scan once it is old."""
+        """Allow the settings to delete a scan once it is old."""
         return self._connection.json("DELETE", path("/scan/{}/pin", scan_id))
 
     def series(self, series_id: str) -> Json:
@@ -195,12 +195,12 @@ class Models(Resource):
         return self._connection.json("POST", "/model/shoot", once=True, json=options)
 
     def view(self, model_id: str, *, again: bool | None = None, if_busy: IfBusy | None = None) -> Json:
-        """Scan the next view of an object that was turned by hand; or repeat the last view."""
+        """Scan the next view of a manually turned object; or repeat the last view."""
         options = given(again=again, if_busy=if_busy)
         return self._connection.json("POST", path("/model/{}/view", model_id), once=True, json=options)
 
     def combine(self, model_id: str) -> Json:
-        """Combine the views that were scanned by hand."""
+        """Combine the views of a manually turned object."""
         return self._connection.json("POST", path("/model/{}/combine", model_id))
 
     def list(self, *, cursor: int | None = None, limit: int | None = None) -> Json:
@@ -224,7 +224,7 @@ class Models(Resource):
         return self._connection.json("PUT", path("/model/{}/pin", model_id))
 
     def unpin(self, model_id: str) -> Json:
-        """Let the settings delete a model once it is old."""
+        """Allow the settings to delete a model once it is old."""
         return self._connection.json("DELETE", path("/model/{}/pin", model_id))
 
     def cancel(self, model_id: str) -> Json:
@@ -291,7 +291,7 @@ class RigState(Resource):
         return self._connection.json("GET", "/rig/file")
 
     def put_file(self, text: str, *, version: str) -> Json:
-        """Have the rig opened by another text of its file, and that kept. version : of the file that it was made of."""
+        """Open the rig by another text of its file, and keep that. version : of the file that it was made of."""
         return self._connection.json("PUT", "/rig/file", json={"text": text, "version": version})
 
     def put_settings(
@@ -302,7 +302,7 @@ class RigState(Resource):
         tolerance_mm: float | None = None,
         refuse_when_stale: bool | None = None,
     ) -> Json:
-        """Change exposures and gains, and what is wanted of scans, in the rig file, and open the rig by it.
+        """Change exposures, gains and the requirements on scans in the rig file, and open the rig by it.
 
         cameras : `exposure_s` and `gain` by name. version : of the file that is changed.
         """
@@ -334,7 +334,7 @@ class Examinations(Resource):
     """Examinations of the rig: doctor, latency of its light, conformance of its drivers."""
 
     def last(self) -> Json:
-        """What each examination found last: `doctor`, `latency`, `conformance`; null where there was none."""
+        """Latest result of each examination: `doctor`, `latency`, `conformance`; null where there was none."""
         return self._connection.json("GET", "/rig/examinations")
 
     def doctor(self, *, search_s: float | None = None, if_busy: IfBusy | None = None) -> Json:
@@ -455,7 +455,7 @@ class CalibrationResource(Resource):
         return self._connection.json("PUT", path("/calibration/{}/pin", calibration_id))
 
     def unpin(self, calibration_id: str) -> Json:
-        """Let the settings delete a calibration once it is old."""
+        """Allow the settings to delete a calibration once it is old."""
         return self._connection.json("DELETE", path("/calibration/{}/pin", calibration_id))
 
     def shoot(
@@ -483,7 +483,7 @@ class CalibrationResource(Resource):
         return self._connection.json("POST", path("/calibration/{}/script", calibration_id), once=True, json=options)
 
     def pose(self, calibration_id: str, number: int) -> Json:
-        """A pose, and what was found in its pictures."""
+        """A pose, and the findings in its pictures."""
         return self._connection.json("GET", path("/calibration/{}/pose/{}", calibration_id, number))
 
     def drop_pose(self, calibration_id: str, number: int) -> None:
@@ -501,7 +501,7 @@ class CalibrationResource(Resource):
         board_shape: Literal["auto", "flat", "bowed"] | None = None,
         measured_mm: Sequence[float] | None = None,
     ) -> Json:
-        """Solve from all accepted poses. measured_mm: both printed scales of the board, where nobody gave them yet."""
+        """Solve from all accepted poses. measured_mm: both printed scales of the board, if not known yet."""
         options = given(board_shape=board_shape, measured_mm=measured_mm)
         return self._connection.json("POST", path("/calibration/{}/solve", calibration_id), json=options)
 
@@ -574,10 +574,10 @@ class RigHealth(Resource):
 
 
 class HandEyeResource(Resource):
-    """Where the rig is on a robot or before it, kept with the calibration in use."""
+    """Pose of the rig on or before a robot, kept with the calibration in use."""
 
     def get(self) -> Json:
-        """Where it is, with covariances and residuals."""
+        """The pose, with covariances and residuals."""
         return self._connection.json("GET", "/hand-eye")
 
     def put(self, document: Mapping[str, Any] | str | bytes) -> Json:
@@ -613,7 +613,7 @@ class HandEyeResource(Resource):
     def check(
         self, poses: Sequence[Mapping[str, Any]], *, calibration: str | None = None, sphere_mm: float | None = None
     ) -> Json:
-        """Hold new poses, as for `solve`, against what is kept."""
+        """Compare new poses, as for `solve`, with the kept result."""
         options = given(calibration=calibration, sphere_mm=sphere_mm)
         return self._connection.json("POST", "/hand-eye/check", json={"poses": list(poses), **options})
 
@@ -795,7 +795,7 @@ class Notices(Resource):
         return self._connection.json("GET", "/notices")
 
     def set_webhook(self, url: str, kinds: Sequence[str] | None = None) -> Json:
-        """Have notices sent to an address by POST; all kinds unless some are named."""
+        """Send notices to an address by POST; all kinds unless some are named."""
         return self._connection.json("PUT", "/notices/webhook", json=given(url=url, kinds=kinds))
 
     def remove_webhook(self) -> None:

@@ -214,4 +214,4 @@ def test_a_program_of_ros_scans_cancels_and_reads_what_was_published(python: str
 def test_a_node_that_cannot_begin_says_why_and_ends(python: str, tmp_path: Path) -> None:
     with running(python, tmp_path / "node.log", *NODE, "url:=scanner") as node:
         assert node.process.wait(STOP_LIMIT_S) == 1
-    assert "'scanner' is no URL of a service" in node.log.read_text()
+    assert "'scanner' is not a URL of a service" in node.log.read_text()

@@ -20,8 +20,8 @@ from fastapi.testclient import TestClient
 from starlette.types import Receive, Scope, Send
 
 from slrig.api import server as connections
-from slrig.api.events import Followed, SharedLooks, followed_feed, followed_job
-from slrig.api.events import told as stream_of
+from slrig.api.events import Followed, SharedQueries, followed_feed, followed_job
+from slrig.api.events import event_stream as stream_of
 from slrig.api.server import (
     ConnectionConfig,
     Deadlines,
@@ -58,7 +58,7 @@ class Jobs:
     def __init__(self, folder: Path) -> None:
         database = Database(folder / "slrig.sqlite")
         self.store = ActingStore(database)
-        self.open: dict[UUID, SharedLooks] = {}
+        self.open: dict[UUID, SharedQueries] = {}
         self.looks: list[int] = []
 
     def followed(self, *, most: int = 500) -> Followed:
@@ -66,7 +66,7 @@ class Jobs:
 
         def look(after: int) -> Any:
             self.looks.append(after)
-            found = whole.look(after)
+            found = whole.query(after)
             assert len(found[0]) <= most
             return found
 
@@ -206,7 +206,7 @@ async def test_twenty_clients_cost_little_more_than_one(jobs: Jobs) -> None:
     # Each begins somewhere else: no look serves two of them.
     late = [jobs.follow(start, most=2) for start in range(20)]
     await asyncio.gather(*(some(stream, 60 - start) for start, stream in enumerate(late)))
-    assert len(jobs.open[EVERY_JOB]._looks) <= 16
+    assert len(jobs.open[EVERY_JOB]._queries) <= 16
     for stream in late:
         await stream.aclose()
     jobs.looks.clear()

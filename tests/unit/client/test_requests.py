@@ -380,7 +380,7 @@ def test_live_pictures_are_arrays_however_the_stream_is_cut() -> None:
 
 @pytest.mark.parametrize("url", ["http://[", "foo", "127.0.0.1:8731", "ftp://127.0.0.1", "http://"])
 def test_an_address_that_is_no_url_is_refused(url: str) -> None:
-    with pytest.raises(ConfigError, match=r"is no URL of a service: .*http://127\.0\.0\.1:8731"):
+    with pytest.raises(ConfigError, match=r"is not a URL of a service: .*http://127\.0\.0\.1:8731"):
         Client(url, None)
 
 
