@@ -49,37 +49,37 @@ _HOLDER = Holder("acceptance", "the plan of an acceptance test", None)
 _COLOURS = {Decision.PASSES: "green", Decision.UNDECIDED: "yellow", Decision.FAILS: "bold red"}
 
 
-def plan_for(asked: AcceptanceOptions, rig: Rig) -> AcceptancePlan:
+def plan_for(options: AcceptanceOptions, rig: Rig) -> AcceptancePlan:
     """The test of an open rig. Raises CalibrationError, InvalidInputError."""
     calibration = required_calibration(rig)
     rendered = rig.truth() is not None
-    volume = rig_volume_mm(calibration) if asked.volume_mm is None else np.array(asked.volume_mm).reshape(2, 3)
+    volume = rig_volume_mm(calibration) if options.volume_mm is None else np.array(options.volume_mm).reshape(2, 3)
     return acceptance_plan(
         calibration,
         volume,
-        _artefacts(asked, exact_artefacts(volume) if rendered else None),
+        _artefacts(options, exact_artefacts(volume) if rendered else None),
         rendered=rendered,
-        limits=_limits(asked, usual_limits(volume, asked.tolerance_mm)),
-        repeats=asked.repeats,
-        exposure_s=asked.exposure_s,
-        notes=asked.notes,
+        limits=_limits(options, usual_limits(volume, options.tolerance_mm)),
+        repeats=options.repeats,
+        exposure_s=options.exposure_s,
+        notes=options.notes,
     )
 
 
-def _limits(asked: AcceptanceOptions, usual: Limits) -> Limits:
-    told = {
-        "form_mm": asked.form_limit_mm,
-        "size_mm": asked.size_limit_mm,
-        "spacing_mm": asked.spacing_limit_mm,
-        "flatness_mm": asked.flatness_limit_mm,
+def _limits(options: AcceptanceOptions, usual: Limits) -> Limits:
+    given = {
+        "form_mm": options.form_limit_mm,
+        "size_mm": options.size_limit_mm,
+        "spacing_mm": options.spacing_limit_mm,
+        "flatness_mm": options.flatness_limit_mm,
     }
-    return replace(usual, **{name: limit for name, limit in told.items() if limit is not None})
+    return replace(usual, **{name: limit for name, limit in given.items() if limit is not None})
 
 
-def _artefacts(asked: AcceptanceOptions, made: Artefacts | None) -> Artefacts:
-    if made is not None and (asked.sphere_mm, asked.bar_mm, asked.plane_mm) == (None, None, None):
-        return replace(made, temperature_c=asked.temperature_c)
-    if asked.sphere_mm is None or asked.bar_mm is None or asked.plane_mm is None:
+def _artefacts(options: AcceptanceOptions, made: Artefacts | None) -> Artefacts:
+    if made is not None and (options.sphere_mm, options.bar_mm, options.plane_mm) == (None, None, None):
+        return replace(made, temperature_c=options.temperature_c)
+    if options.sphere_mm is None or options.bar_mm is None or options.plane_mm is None:
         message = (
             "an acceptance test needs --sphere DIAMETER U, --bar DISTANCE U and --plane LENGTH WIDTH: values and "
             "expanded uncertainties (k = 2) from the certificates, in mm"
@@ -87,21 +87,21 @@ def _artefacts(asked: AcceptanceOptions, made: Artefacts | None) -> Artefacts:
         raise InvalidInputError(message)
     exact = None if made is None else 0.0
     return Artefacts(
-        Certified(*asked.sphere_mm),
-        Certified(*asked.bar_mm),
-        asked.plane_mm,
-        asked.ball_mm,
-        exact if asked.sphere_form_mm is None else asked.sphere_form_mm,
-        exact if asked.plane_form_mm is None else asked.plane_form_mm,
-        asked.certificate,
-        asked.temperature_c,
-        asked.expansion_per_k if asked.expansion_per_k is not None else STEEL_PER_K if made is None else 0.0,
-        asked.fixture_mm,
+        Certified(*options.sphere_mm),
+        Certified(*options.bar_mm),
+        options.plane_mm,
+        options.ball_mm,
+        exact if options.sphere_form_mm is None else options.sphere_form_mm,
+        exact if options.plane_form_mm is None else options.plane_form_mm,
+        options.certificate,
+        options.temperature_c,
+        options.expansion_per_k if options.expansion_per_k is not None else STEEL_PER_K if made is None else 0.0,
+        options.fixture_mm,
     )
 
 
-def accept(rig_file: Path, asked: AcceptanceOptions, *, output: Path, scripted: bool, as_json: bool) -> bool:
-    """Do the test, print what was decided, and return whether the rig passes.
+def accept(rig_file: Path, options: AcceptanceOptions, *, output: Path, scripted: bool, as_json: bool) -> bool:
+    """Do the test, print the decision, and return whether the rig passes.
 
     Raises
     ------
@@ -110,15 +110,15 @@ def accept(rig_file: Path, asked: AcceptanceOptions, *, output: Path, scripted: 
     """
     set_up_console_logs()
     config = read_rig(rig_file)
-    if asked.tolerance_mm is None:
-        asked = replace(asked, tolerance_mm=config.tolerance_mm)
+    if options.tolerance_mm is None:
+        options = replace(options, tolerance_mm=config.tolerance_mm)
     _require_free(output)
     console = Console(stderr=as_json)
     with TemporaryDirectory(prefix="slrig-acceptance-") as scratch:
         if scripted:
-            config = moving(config, asked, Path(scratch))
+            config = moving(config, options, Path(scratch))
         with local_manager(config, PositionJob) as manager:
-            plan = manager.lend(_HOLDER, lambda rig, _: plan_for(asked, rig.open()))
+            plan = manager.lend(_HOLDER, lambda rig, _: plan_for(options, rig.open()))
             if scripted:
                 with progress_shown() as display:
                     result = measure_positions(manager, plan, output, Listener(report=display))
@@ -129,17 +129,17 @@ def accept(rig_file: Path, asked: AcceptanceOptions, *, output: Path, scripted: 
     if as_json:
         typer.echo((output / JSON).read_text(encoding="utf-8"), nl=False)
     else:
-        tell(result, console)
+        print_result(result, console)
         console.print(f"report: {output / HTML}", markup=False, style="dim")
     return result.decision is Decision.PASSES
 
 
-def moving(config: RigConfig, asked: AcceptanceOptions, folder: Path) -> RigConfig:
+def moving(config: RigConfig, options: AcceptanceOptions, folder: Path) -> RigConfig:
     """The rig by which the artefacts are moved: itself if its positioner knows the positions, else, of a rendered rig,
     one with a scene of artefacts in place of its own, which is written into `folder`.
     """
     with open_rig(config) as rig:
-        plan = plan_for(asked, rig)
+        plan = plan_for(options, rig)
         known = () if rig.positioner is None else tuple(rig.positioner.poses)
     if all(step.name in known for step in plan.steps):
         return config
@@ -147,14 +147,14 @@ def moving(config: RigConfig, asked: AcceptanceOptions, folder: Path) -> RigConf
 
 
 class Person:
-    """Places the artefacts of a plan, as a console tells."""
+    """A person who places the artefacts of a plan, guided by a console."""
 
     def __init__(self, plan: AcceptancePlan, console: Console) -> None:
         self._names = [step.name for step in plan.steps]
         self._console = console
 
     def place(self, step: Step) -> None:
-        """Tell what to place, and wait for Enter; q ends the test (ScanCancelledError)."""
+        """Print what to place, and wait for Enter; q ends the test (ScanCancelledError)."""
         number = self._names.index(step.name) + 1
         self._console.print(Text.assemble((f"\n{number} of {len(self._names)}  ", "bold"), step.words))
         x, y, z = (float(each) for each in step.centre_mm)
@@ -164,7 +164,7 @@ class Person:
             raise ScanCancelledError(message)
 
     def read(self, step: Step, error: SlrigError) -> None:
-        """Tell why an artefact has to be placed again."""
+        """Print why an artefact has to be placed again."""
         self._console.print(Text(f"{step.name}: {error}", style="red"))
 
 
@@ -219,8 +219,8 @@ def _require_free(folder: Path) -> None:
         raise InvalidInputError(message)
 
 
-def tell(result: AcceptanceResult, console: Console) -> None:
-    """Print what was decided."""
+def print_result(result: AcceptanceResult, console: Console) -> None:
+    """Print the decision."""
     table = Table(box=None, title=f"Acceptance test of '{result.rig}'", title_justify="left")
     for name in ("", "worst error", "limit", "U (k = 2)", "position", "decision"):
         table.add_column(name, justify="left" if name in {"", "position", "decision"} else "right")

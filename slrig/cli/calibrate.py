@@ -1,4 +1,4 @@
-"""`slrig calibrate`: print a board, walk through its poses, solve them, and look after what came of it."""
+"""`slrig calibrate`: print a board, walk through its poses, solve them, and manage the calibrations."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ FILES = {
     ".xml": "calibration.xml",
     ".html": "report.html",
 }
-"""What a file to be exported holds, by its ending."""
+"""Content of an exported file, by its ending."""
 
-_ID_HELP = "Id of the calibration, or the beginning of it that no other has."
+_ID_HELP = "Id of the calibration, or its beginning, unless others share it."
 CalibrationId = Annotated[str, typer.Argument(metavar="ID", help=_ID_HELP)]
 Shape = Annotated[
     Literal["auto", "flat", "bowed"],
@@ -60,7 +60,7 @@ Shape = Annotated[
 @grouped
 def board(
     output: Annotated[Path, typer.Option(help="File for the page: .pdf or .svg.")],
-    asked: BoardArguments,
+    board_options: BoardArguments,
     page: Annotated[
         str, typer.Option(help="A4, A3, letter; fit, as large as the board needs; or WIDTHxHEIGHT in mm.")
     ] = "A4",
@@ -71,7 +71,7 @@ def board(
     """
     from slrig.cli.calibrate_local import chosen_board, write_board
 
-    write_board(chosen_board(asked), output, page=page)
+    write_board(chosen_board(board_options), output, page=page)
 
 
 @app.command(cls=SubjectsCommand)
@@ -82,7 +82,7 @@ def solve(
         typer.Argument(metavar="FOLDER", help="Folder with one bundle per pose, each a folder with bundle.json."),
     ],
     output: Annotated[Path, typer.Option(help="File for the calibration: .json, or OpenCV's .yml or .xml.")],
-    asked: BoardArguments,
+    board_options: BoardArguments,
     board_shape: Shape = "auto",
     report: Annotated[Path | None, typer.Option(help="Write the report, one HTML page with pictures, as well.")] = None,
     earlier: Annotated[
@@ -103,7 +103,7 @@ def solve(
     shape = BoardShape(board_shape)
     solve_folder(
         folder,
-        chosen_board(asked),
+        chosen_board(board_options),
         output,
         report=report,
         earlier=earlier,
@@ -123,7 +123,7 @@ def solve(
 )  # fmt: skip
 def run(
     *,
-    asked: BoardArguments,
+    board_options: BoardArguments,
     board_shape: Shape = "auto",
     cameras_alone: Annotated[
         bool, typer.Option("--cameras-alone", help="Calibrate cameras, or one, without the projector: light is white.")
@@ -156,7 +156,7 @@ def run(
     from slrig.cli.scan import client_of
     from slrig.config import read_settings
 
-    chosen = chosen_board(asked) if resume is None else None
+    chosen = chosen_board(board_options) if resume is None else None
     kept = None if rig is None else read_settings(None, **given(data_dir=data)).data_dir
     with client_of(rig, service, kept) as client:
         walk(
@@ -188,12 +188,12 @@ def hand_eye(
             help="A folder with a bundle (with --sphere: a scan) per pose; or poses of a body in the rig.",
         ),
     ],
-    asked: BoardArguments,
+    board_options: BoardArguments,
     robot: RobotOptions,
     mounting: Annotated[
         Literal["in-hand", "fixed"] | None,
         typer.Option(
-            "--kind", help="in-hand: the rig is on the flange; fixed: it stands still, the robot holds the target."
+            "--kind", help="in-hand: the rig is on the flange; fixed: it does not move, the robot holds the target."
         ),
     ] = None,
     calibration: Annotated[
@@ -202,9 +202,9 @@ def hand_eye(
     sphere: Annotated[float | None, typer.Option(help="The target is a sphere of this diameter, mm.")] = None,
     output: Annotated[Path | None, typer.Option(help="File for the result, hand_eye.json.")] = None,
     check: Annotated[
-        Path | None, typer.Option(help="A hand_eye.json to hold the poses against, instead of solving: did it drift?")
+        Path | None, typer.Option(help="A hand_eye.json to check by the poses, instead of solving: did it drift?")
     ] = None,
-    keep: Annotated[bool, typer.Option("--keep", help="Have a running service keep the result for its scans.")] = False,
+    keep: Annotated[bool, typer.Option("--keep", help="Store the result in a running service for its scans.")] = False,
     *,
     service: ServiceOptions,
     as_json: AsJson = False,
@@ -213,11 +213,11 @@ def hand_eye(
 
     The robot shows the rig a board or a sphere, or shows a fixed one to the rig, in 12 poses that turn about two axes.
     """
-    from slrig.cli.hand_eye import check_poses, seen_by_rig, solve_poses
+    from slrig.cli.hand_eye import check_poses, observed_by_rig, solve_poses
 
     if (check is None) == (mounting is None) or (output is None) == (check is None):
         raise ConfigError("expected --kind and --output to solve, or --check FILE alone to check; give one of the two")
-    given, identifier = seen_by_rig(poses, seen, robot.rotation, asked, calibration, sphere)
+    given, identifier = observed_by_rig(poses, seen, robot.rotation, board_options, calibration, sphere)
     if check is not None:
         if not check_poses(given, identifier, check, as_json=as_json):
             raise typer.Exit(1)
@@ -265,13 +265,13 @@ def list_stored(service: ServiceOptions, as_json: AsJson = False) -> None:
 @app.command()
 @grouped
 def show(calibration: CalibrationId, service: ServiceOptions, as_json: AsJson = False) -> None:
-    """Show how good a calibration is, or what its poses still lack."""
-    from slrig.cli.calibrate_walk import tell_session
+    """Show the quality of a calibration, or what its poses still lack."""
+    from slrig.cli.calibrate_walk import print_session
     from slrig.cli.display import print_json
 
     with service.client() as client:
         session = client.get(_path(client, calibration))
-    (print_json if as_json else tell_session)(session)
+    (print_json if as_json else print_session)(session)
 
 
 @app.command()
@@ -280,7 +280,7 @@ def check(
     poses: Annotated[
         str, typer.Argument(metavar="FOLDER_OR_ID", help="Folder with one bundle per pose, or a calibration's id.")
     ],
-    asked: BoardArguments,
+    board_options: BoardArguments,
     board_shape: Shape = "auto",
     *,
     service: ServiceOptions,
@@ -294,9 +294,9 @@ def check(
         from slrig.calibration import BoardShape
         from slrig.cli.calibrate_local import check_folder, chosen_board
 
-        check_folder(Path(poses), chosen_board(asked), board_shape=BoardShape(board_shape), as_json=as_json)
+        check_folder(Path(poses), chosen_board(board_options), board_shape=BoardShape(board_shape), as_json=as_json)
         return
-    from slrig.cli.calibrate_walk import checked, tell_check
+    from slrig.cli.calibrate_walk import checked, print_check
     from slrig.cli.display import print_json
 
     with service.client() as client:
@@ -304,7 +304,7 @@ def check(
     if session["result"] is None:
         message = f"Calibration {session['id'][:8]} has no solve to check: it is {_unsolved(session)}."
         raise ServiceError(message)
-    (print_json if as_json else tell_check)(checked(session["result"]))
+    (print_json if as_json else print_check)(checked(session["result"]))
 
 
 @app.command()
@@ -317,15 +317,15 @@ def compare(
 ) -> None:
     """Compare two calibrations, and say by how much points move.
 
-    Tells what the second one says otherwise than the first.
+    Shows the differences of the second one from the first.
     """
-    from slrig.cli.calibrate_walk import tell_comparison
+    from slrig.cli.calibrate_walk import print_comparison
     from slrig.cli.display import print_json
 
     with service.client() as client:
         ids = f"first={_whole_id(client, first)}&second={_whole_id(client, second)}"
         found = client.get(f"/calibration/compare?{ids}")
-    (print_json if as_json else tell_comparison)(found)
+    (print_json if as_json else print_comparison)(found)
 
 
 @app.command()
@@ -382,7 +382,7 @@ def refine(
 @app.command()
 @grouped
 def activate(calibration: CalibrationId, service: ServiceOptions) -> None:
-    """Have scans use a calibration from now on."""
+    """Use a calibration for scans from now on."""
     with service.client() as client:
         found = client.post(f"{_path(client, calibration)}/activate", None)
     typer.echo(f"Scans use calibration {found['id'][:8]} from now on.")
@@ -391,7 +391,7 @@ def activate(calibration: CalibrationId, service: ServiceOptions) -> None:
 @app.command()
 @grouped
 def deactivate(calibration: CalibrationId, service: ServiceOptions) -> None:
-    """Have scans use the rig's own calibration again."""
+    """Use the rig's own calibration for scans again."""
     with service.client() as client:
         client.post(f"{_path(client, calibration)}/deactivate", None)
     typer.echo("Scans use the rig's own calibration again.")
@@ -409,13 +409,13 @@ def export(
     ] = None,
     to: Annotated[
         Literal["slrig", "opencv", "ros", "kalibr"] | None,
-        typer.Option(help="Whose form. ros: a new folder of camera_info and transforms. Default: by the ending."),
+        typer.Option(help="Format. ros: a new folder of camera_info and transforms. Default: by the ending."),
     ] = None,
     unit: Unit = None,
     keys: Keys = None,
     template: Annotated[
         Path | None,
-        typer.Option(help="Write an empty calibration with explanations instead, to fill by hand: .json or .yml."),
+        typer.Option(help="Write an empty calibration with explanations instead, to fill in: .json or .yml."),
     ] = None,
     camera: Annotated[
         list[str] | None, typer.Option(help="With --template: name of a camera; may be repeated. Default: cam0.")
@@ -499,7 +499,7 @@ def submit(
     from slrig.importers import import_calibration
 
     with service.client() as client:
-        # Looked at here first, so that faults are told by the file's name; one form travels, whichever the file has.
+        # Read here first, so that faults name the file; it is sent in one format.
         read = import_calibration(file, unit=unit, keys=keys or ())
         for note in read.notes:
             typer.echo(f"{'read':<10}{note}")
@@ -522,7 +522,7 @@ def _path(client: Client, beginning: str) -> str:
 
 
 def _whole_id(client: Client, beginning: str) -> str:
-    """The id of the one calibration whose id begins so. Raises CalibrationNotFoundError."""
+    """The id of the one calibration with this beginning. Raises CalibrationNotFoundError."""
     known = client.get("/calibration?limit=200")["calibrations"]
     none = "none; open one with: slrig calibrate run"
     return str(by_beginning(known, beginning, "calibration", CalibrationNotFoundError, none=none)["id"])

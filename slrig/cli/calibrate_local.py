@@ -23,7 +23,7 @@ from slrig.calibrate.verification import VerificationJob, verify_bundle
 from slrig.calibration import DEFAULT_BOARD, PROJECTOR, Board, BoardKind, BoardShape
 from slrig.calibration.health import Health, HealthState, Verification, judge_health, verification_from_document
 from slrig.calibration.poses import check_same_devices
-from slrig.cli.calibrate_walk import checked, tell_check, tell_result
+from slrig.cli.calibrate_walk import checked, print_check, print_result
 from slrig.cli.display import ProgressDisplay, counted, print_json, progress_shown
 from slrig.cli.local import run_job
 from slrig.cli.options import BoardArguments
@@ -41,12 +41,12 @@ if TYPE_CHECKING:
 DESCRIPTION = "bundle.json"
 ENDINGS = (".json", ".yml", ".yaml", ".xml")
 _READING_SHARE = 0.5
-_MOST_TOLD = 5
+_MOST_LISTED = 5
 
 
 @dataclass(slots=True)
 class Readings:
-    """What was read. refused : by pose, why it was left out; remarks : by pose, what could be better about it."""
+    """Poses that were read. refused : by pose, why it was left out; remarks : by pose, possible improvements."""
 
     poses: list[ReadPose] = field(default_factory=list)
     refused: dict[str, str] = field(default_factory=dict)
@@ -67,7 +67,7 @@ def solve_folder(
     """Read the poses, solve, print how good the calibration is, and write it and its report.
 
     earlier : file of a calibration of the same devices, to compare the scale with. board_shape : whether the board may
-    be bowed. tolerance_mm : what a point of a scan may be wrong by.
+    be bowed. tolerance_mm : largest error of a point of a scan.
 
     Raises ConfigError or StorageError where the output cannot be written, BundleError where there are no bundles,
     CalibrationError where the poses are of different rigs or the earlier calibration cannot be read, PoseRefusedError
@@ -80,7 +80,7 @@ def solve_folder(
     if as_json:
         print_json({**document, "output": str(output), "report": report and str(report)})
         return
-    tell_result(document, Console())
+    print_result(document, Console())
     typer.echo(f"\n{'written':<10}{output}")
     if report is not None:
         typer.echo(f"{'report':<10}{report}")
@@ -92,7 +92,7 @@ def check_folder(folder: Path, board: Board, *, board_shape: BoardShape, as_json
     Raises as `solve_folder` does, and ConfigError where the poses are too few to be halved.
     """
     document = _solved(folder, board, None, report=None, earlier=None, board_shape=board_shape, tolerance_mm=None)
-    (print_json if as_json else tell_check)(checked(document))
+    (print_json if as_json else print_check)(checked(document))
 
 
 def _solved(
@@ -105,7 +105,7 @@ def _solved(
     board_shape: BoardShape,
     tolerance_mm: float | None,
 ) -> dict[str, Any]:
-    """Solve, write the calibration and its report where a file is named, and return what is told of it."""
+    """Solve, write the calibration and its report where a file is named, and return the document of the result."""
     set_up_console_logs()
     bundles = pose_bundles(folder)
     before = None if earlier is None else read_calibration(earlier)
@@ -192,7 +192,7 @@ def _require_writable(output: Path, report: Path | None) -> None:
 
 
 def _one_rig(bundles: Mapping[str, Path], found: Readings) -> dict[str, Size]:
-    """The devices that most of the bundles are of. Those whose description cannot be read are refused in `found`.
+    """The devices of most of the bundles. Those without a readable description are refused in `found`.
 
     Raises CalibrationError where a bundle is of another rig than most.
     """
@@ -234,14 +234,14 @@ def _read(bundles: Mapping[str, Path], setting: Setting, found: Readings, displa
 
 
 def _none_left(folder: Path, board: Board, refused: Mapping[str, str]) -> str:
-    """Words for the case that no pose can be used: the causes, each with the poses that it is of."""
+    """Message for the case that no pose can be used: the causes, each with its poses."""
     causes: dict[str, list[str]] = {}
     for name, cause in refused.items():
         causes.setdefault(cause, []).append(name)
     lines = [f"{folder}: none of its poses ({len(refused)}) shows a {board.title} that can be used:"]
-    lines += [f"  {_listed(names)}: {cause}" for cause, names in list(causes.items())[:_MOST_TOLD]]
-    if len(causes) > _MOST_TOLD:
-        lines.append(f"  and {len(causes) - _MOST_TOLD} causes more")
+    lines += [f"  {_listed(names)}: {cause}" for cause, names in list(causes.items())[:_MOST_LISTED]]
+    if len(causes) > _MOST_LISTED:
+        lines.append(f"  and {len(causes) - _MOST_LISTED} causes more")
     lines.append(
         "Is this the board? --corners counts inner corners, across x down (where four squares meet), and of circles "
         "those of one row x rows."
@@ -252,8 +252,8 @@ def _none_left(folder: Path, board: Board, refused: Mapping[str, str]) -> str:
 def _with_refused(message: str, refused: Mapping[str, str]) -> str:
     if not refused:
         return message
-    lines = [f"  {name}: {cause}" for name, cause in list(refused.items())[:_MOST_TOLD]]
-    more = [f"  and {len(refused) - _MOST_TOLD} more"] if len(refused) > _MOST_TOLD else []
+    lines = [f"  {name}: {cause}" for name, cause in list(refused.items())[:_MOST_LISTED]]
+    more = [f"  and {len(refused) - _MOST_LISTED} more"] if len(refused) > _MOST_LISTED else []
     verb = "was" if len(refused) == 1 else "were"
     return "\n".join([message, f"{counted(len(refused), 'pose')} {verb} not used:", *lines, *more])
 
@@ -293,14 +293,14 @@ _COLOURS = {HealthState.GOOD: "green", HealthState.WATCH: "yellow", HealthState.
 
 
 def verify(source: Path, board: Board, calibration_file: Path | None, *, position: int | None, as_json: bool) -> bool:
-    """Verify, print what was found, and return whether the calibration still holds (good or watch).
+    """Verify, print the findings, and return whether the calibration still holds (good or watch).
 
-    source : a bundle (a folder), or a rig file, whose own calibration is verified unless another one is named.
+    source : a bundle (a folder), or a rig file; its own calibration is verified unless another one is named.
 
     Raises
     ------
     SlrigError
-        There is no calibration, the rig cannot be opened, or the board is not to be seen.
+        There is no calibration, the rig cannot be opened, or the board is not visible.
     """
     set_up_console_logs()
     with progress_shown() as display:
@@ -317,11 +317,11 @@ def verify(source: Path, board: Board, calibration_file: Path | None, *, positio
         found = {"state": str(health.state), "reasons": list(health.reasons), "remedy": health.remedy}
         print_json({**found, **verification.document()})
     else:
-        tell(verification, health, Console())
+        print_verification(verification, health, Console())
     return health.state is not HealthState.STALE
 
 
-def tell(verification: Verification, health: Health, console: Console) -> None:
+def print_verification(verification: Verification, health: Health, console: Console) -> None:
     """Print a verification for people."""
     console.print(f"[{_COLOURS[health.state]}]{health.state}[/{_COLOURS[health.state]}]  {escape(health.reasons[0])}")
     for reason in health.reasons[1:]:
@@ -348,8 +348,8 @@ def _calibration(path: Path) -> Calibration:
     return read_calibration(path)
 
 
-def chosen_board(asked: BoardArguments) -> Board:
-    """The board that a command's options describe; without any, the usual one, which is then told on stderr.
+def chosen_board(given: BoardArguments) -> Board:
+    """The board that a command's options describe; without any, the usual one, which is then named on stderr.
 
     The usual board may be named in part, so that a print that measures 11.94 mm is `--square-mm 11.94`. Any other board
     is named whole: a square's side that is guessed would scale every scan.
@@ -359,35 +359,35 @@ def chosen_board(asked: BoardArguments) -> Board:
     CalibrationError
         The options describe no board, or another than the usual one and not the whole of it.
     """
-    needed = {"--board": asked.kind, "--corners": asked.corners, "--square-mm": asked.square_mm}
+    needed = {"--board": given.kind, "--corners": given.corners, "--square-mm": given.square_mm}
     missing = [name for name, value in needed.items() if value is None]
     if not missing:
         return _as_printed(
             board_option(
-                str(asked.kind), str(asked.corners), float(asked.square_mm or 0), asked.marker_mm, asked.dictionary
+                str(given.kind), str(given.corners), float(given.square_mm or 0), given.marker_mm, given.dictionary
             ),
-            asked,
+            given,
         )
     usual = (DEFAULT_BOARD.columns, DEFAULT_BOARD.rows)
-    if asked.kind not in (None, DEFAULT_BOARD.kind) or (asked.corners is not None and _counted(asked.corners) != usual):
+    if given.kind not in (None, DEFAULT_BOARD.kind) or (given.corners is not None and _counted(given.corners) != usual):
         message = (
             f"Which board? Missing: {', '.join(missing)}. Name all of it, as --board chessboard --corners 9x6 "
             f"--square-mm 20, or nothing for the usual one: {DEFAULT_BOARD.description}"
         )
         raise CalibrationError(message)
-    square_mm = DEFAULT_BOARD.square_mm if asked.square_mm is None else asked.square_mm
+    square_mm = DEFAULT_BOARD.square_mm if given.square_mm is None else given.square_mm
     corners = f"{DEFAULT_BOARD.columns}x{DEFAULT_BOARD.rows}"
-    board = _as_printed(board_option(DEFAULT_BOARD.kind, corners, square_mm, asked.marker_mm, asked.dictionary), asked)
+    board = _as_printed(board_option(DEFAULT_BOARD.kind, corners, square_mm, given.marker_mm, given.dictionary), given)
     typer.echo(f"board     {board.description} (--board, --corners and --square-mm name another)", err=True)
     return board
 
 
-def _as_printed(board: Board, asked: BoardArguments) -> Board:
-    """The board with what was said of the size of its print."""
-    if asked.square_sigma is not None:
-        board = replace(board, square_sigma=asked.square_sigma)
+def _as_printed(board: Board, given: BoardArguments) -> Board:
+    """The board with the size of its print as given."""
+    if given.square_sigma is not None:
+        board = replace(board, square_sigma=given.square_sigma)
     return (
-        board if asked.measured_mm is None else board.as_measured(*asked.measured_mm, square_sigma=asked.square_sigma)
+        board if given.measured_mm is None else board.as_measured(*given.measured_mm, square_sigma=given.square_sigma)
     )
 
 

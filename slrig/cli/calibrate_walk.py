@@ -49,9 +49,9 @@ _EMPTY, _BEYOND = "·", " "
 
 
 def outcome(pose: Mapping[str, Any]) -> str:
-    """What became of a pose, as the service tells of it, in a word."""
-    words: dict[bool | None, str] = {True: "accepted", False: "refused", None: pose["state"]}
-    return words[pose["accepted"]]
+    """Outcome of a pose, in a word, by the service's description."""
+    names: dict[bool | None, str] = {True: "accepted", False: "refused", None: pose["state"]}
+    return names[pose["accepted"]]
 
 
 def refused(session: Mapping[str, Any]) -> dict[str, str]:
@@ -59,8 +59,8 @@ def refused(session: Mapping[str, Any]) -> dict[str, str]:
     return {pose["name"]: pose["error"]["detail"] for pose in session["shot"] if pose["accepted"] is False}
 
 
-def tell_session(session: Mapping[str, Any]) -> None:
-    """Print a calibration that a service keeps: its result, or what it covers and what to do next."""
+def print_session(session: Mapping[str, Any]) -> None:
+    """Print a calibration of a service: its result, or its coverage and the next step."""
     console = Console()
     board = "imported" if session["board"] is None else session["board"]["title"]
     heading = [session["id"], session["label"], f"rig '{session['rig']}'", board, session["state"]]
@@ -69,29 +69,29 @@ def tell_session(session: Mapping[str, Any]) -> None:
         console.print("Scans use it.", style="green")
     if session["result"] is not None:
         console.print()
-        tell_result({**session["result"], "refused": refused(session)}, console)
+        print_result({**session["result"], "refused": refused(session)}, console)
     if session["error"] is not None:
         console.print(Text(session["error"]["detail"], style="red"))
     if session["coverage"] is not None and session["state"] != "solved":
         console.print()
         console.print(coverage_picture(session["coverage"], session["next_move"], {}))
-        tell_next(session["next_move"], console)
+        print_next_move(session["next_move"], console)
 
 
-def tell_comparison(found: Mapping[str, Any]) -> None:
-    """Print what the second of two calibrations says otherwise than the first."""
+def print_comparison(found: Mapping[str, Any]) -> None:
+    """Print the differences of the second of two calibrations from the first."""
     console = Console()
-    for words in found["words"]:
-        console.print(_listed("·", words))
+    for difference in found["words"]:
+        console.print(_listed("·", difference))
     table = plain_table("second − first", *(Column(Text(name), justify="right") for name in found["devices"]))
-    for key, words in _DIFFERENCES.items():
-        table.add_row(words, *(_difference(device[key]) for device in found["devices"].values()))
+    for key, label in _DIFFERENCES.items():
+        table.add_row(label, *(_difference(device[key]) for device in found["devices"].values()))
     console.print()
     console.print(table)
 
 
 def checked(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Of what `pose_judging.summary` holds, the check by odd and even poses, and what it stands beside.
+    """The check by odd and even poses of `pose_judging.summary`, with the figures to compare.
 
     Raises ConfigError where there is none: too few poses, or solved before solves were checked.
     """
@@ -105,8 +105,8 @@ def checked(document: Mapping[str, Any]) -> dict[str, Any]:
     return {key: document[key] for key in ("odd_even", "expected", "poses", "outliers")}
 
 
-def tell_check(found: Mapping[str, Any]) -> None:
-    """Print what `checked` returns."""
+def print_check(found: Mapping[str, Any]) -> None:
+    """Print the result of `checked`."""
     console, halves = Console(), found["odd_even"]
     console.print(_listed("·" if halves["fits"] else "!", halves["words"]))
     console.print()
@@ -120,13 +120,13 @@ def tell_check(found: Mapping[str, Any]) -> None:
     console.print(table)
 
 
-def tell_result(document: Mapping[str, Any], console: Console) -> None:
-    """Print what `pose_judging.summary` of a session holds, and which poses were `refused` or have `remarks`."""
+def print_result(document: Mapping[str, Any], console: Console) -> None:
+    """Print the `pose_judging.summary` of a session, and which poses were `refused` or have `remarks`."""
     verdict = document["verdict"]
-    words = verdict["grade"].replace("_", " ")
-    mark = (f" {words.upper()} ", f"bold reverse {_COLOURS.get(verdict['grade'], 'red')}")
-    # The summary without the verdict's own word, which stands before it already.
-    console.print(Text.assemble(mark, f"  {verdict['summary'].removeprefix(words).lstrip(':; ')}"))
+    grade = verdict["grade"].replace("_", " ")
+    mark = (f" {grade.upper()} ", f"bold reverse {_COLOURS.get(verdict['grade'], 'red')}")
+    # The summary without the grade, which is printed before it already.
+    console.print(Text.assemble(mark, f"  {verdict['summary'].removeprefix(grade).lstrip(':; ')}"))
     for reason in verdict["reasons"][:_MOST_REASONS]:
         console.print(_listed("·", reason))
     more = len(verdict["reasons"]) - _MOST_REASONS
@@ -138,16 +138,16 @@ def tell_result(document: Mapping[str, Any], console: Console) -> None:
     console.print(_devices(document["devices"]))
     console.print()
     console.print(_figures(document))
-    _tell_named(console, "left out", document["outliers"])
-    _tell_named(console, "refused", document.get("refused", {}))
-    remarks = {name: "; ".join(words) for name, words in document.get("remarks", {}).items() if words}
-    _tell_named(console, "remarks", remarks)
+    _print_named(console, "left out", document["outliers"])
+    _print_named(console, "refused", document.get("refused", {}))
+    remarks = {name: "; ".join(each) for name, each in document.get("remarks", {}).items() if each}
+    _print_named(console, "remarks", remarks)
 
 
-def figure_words(value: float | None, sigma: float | None) -> str:
+def figure_text(value: float | None, sigma: float | None) -> str:
     """A number with its standard deviation to two digits, and so many decimals itself.
 
-    >>> figure_words(1810.4, 0.213), figure_words(0.0, 0.0), figure_words(None, None)
+    >>> figure_text(1810.4, 0.213), figure_text(0.0, 0.0), figure_text(None, None)
     ('1810.40 ± 0.21', '0 (held)', '–')
     """
     if value is None:
@@ -167,9 +167,9 @@ def _devices(devices: Mapping[str, Mapping[str, Any]]) -> Table:
     table.add_row("held out, px", *(_held_out(device) for device in found))
     table.add_row("noise alone, px", *(_px(device["stated_rms_px"]) for device in found))
     for key, name in _NAMES.items():
-        table.add_row(name, *(figure_words(*device["values"][key]) for device in found))
+        table.add_row(name, *(figure_text(*device["values"][key]) for device in found))
     for term in dict.fromkeys(term for device in found for term in device["distortion"]):
-        cells = (figure_words(*device["values"].get(term, (None, None))) for device in found)
+        cells = (figure_text(*device["values"].get(term, (None, None))) for device in found)
         table.add_row(f"lens {term}", *cells)
     return table
 
@@ -181,20 +181,20 @@ def _figures(document: Mapping[str, Any]) -> Table:
     sides = " × ".join(f"{most - least:.0f}" for least, most in zip(low, high, strict=True))
     # Results on record from before one camera could be calibrated alone do not say across.
     way = "across the line of sight " if expected.get("across") else ""
-    words = f"a point {_mm(expected['point_mm'])} (1 σ) {way}by the calibration"
+    text = f"a point {_mm(expected['point_mm'])} (1 σ) {way}by the calibration"
     if expected["total_mm"] is not None:
-        words += f", {_mm(expected['total_mm'])} with its noise"
+        text += f", {_mm(expected['total_mm'])} with its noise"
     if expected["length_share"] is not None:
-        words += f"; a length {rounded(1000 * expected['length_share'])} mm per metre"
+        text += f"; a length {rounded(1000 * expected['length_share'])} mm per metre"
     if expected.get("board_mm"):
-        words += f"; of the point's error {_mm(expected['board_mm'])} by the size of the board"
-    table.add_row("error", words)
+        text += f"; of the point's error {_mm(expected['board_mm'])} by the size of the board"
+    table.add_row("error", text)
     if (halves := document.get("odd_even")) is not None:
         apart = f"odd and even poses differ by {_mm(halves['difference_mm'])}, {halves['ratio']:.2f} × what is stated"
         table.add_row("check", f"{apart} for halves")
     table.add_row("volume", f"{sides} mm, where the board was held")
     for pair in document["baselines"]:
-        length = figure_words(pair["length_mm"]["value"], pair["length_mm"]["sigma"])
+        length = figure_text(pair["length_mm"]["value"], pair["length_mm"]["sigma"])
         names = Text(f"{pair['first']} – {pair['second']}: {length} mm apart, at {pair['angle_deg']['value']:.1f}°")
         table.add_row("baseline", names)
     if document.get("board"):
@@ -204,21 +204,21 @@ def _figures(document: Mapping[str, Any]) -> Table:
     return table
 
 
-def _tell_named(console: Console, heading: str, words: Mapping[str, str]) -> None:
-    if not words:
+def _print_named(console: Console, heading: str, reasons: Mapping[str, str]) -> None:
+    if not reasons:
         return
     heads = (Column(style="bold", no_wrap=True), Column(no_wrap=True), Column(overflow="fold"))
     table = plain_table(*heads, show_header=False)
-    for at, (name, reason) in enumerate(list(words.items())[:_MOST_POSES]):
+    for at, (name, reason) in enumerate(list(reasons.items())[:_MOST_POSES]):
         table.add_row(heading if at == 0 else "", Text(name), Text(reason))
-    if len(words) > _MOST_POSES:
-        table.add_row("", f"and {len(words) - _MOST_POSES} more", "")
+    if len(reasons) > _MOST_POSES:
+        table.add_row("", f"and {len(reasons) - _MOST_POSES} more", "")
     console.print(table)
 
 
-def _listed(mark: str, words: str) -> Table:
+def _listed(mark: str, text: str) -> Table:
     table = Table.grid(padding=(0, 1))
-    table.add_row(f" {mark}", Text(words, overflow="fold"))
+    table.add_row(f" {mark}", Text(text, overflow="fold"))
     return table
 
 
@@ -248,10 +248,10 @@ def _difference(found: Mapping[str, Any] | None) -> str:
 def coverage_picture(
     coverage: Mapping[str, Any], next_move: Mapping[str, Any] | None, sizes_px: Mapping[str, Sequence[int]]
 ) -> Group:
-    """Cells of each device side by side, each with the number of poses that it was seen in; then what is wanted.
+    """Cells of each device side by side, each with the number of poses in it; then what is missing.
 
-    coverage, next_move : as a calibration session tells them over HTTP. sizes_px : (width, height) by camera: with it
-    the cells where the board should go next are marked.
+    coverage, next_move : of a calibration session over HTTP. sizes_px : (width, height) by camera: with it the cells
+    where the board should go next are marked.
     """
     table = Table.grid(padding=(0, 4, 0, 0))
     blocks = []
@@ -266,7 +266,7 @@ def coverage_picture(
     return Group(table, Text(""), wanted) if wanted.row_count else Group(table)
 
 
-def tell_next(next_move: Mapping[str, Any] | None, console: Console) -> None:
+def print_next_move(next_move: Mapping[str, Any] | None, console: Console) -> None:
     """Print what to do with the board next, and why."""
     if next_move is None:
         return
@@ -306,7 +306,7 @@ def _covered(device: Mapping[str, Any]) -> list[Text]:
 
 
 def _aim(next_move: Mapping[str, Any] | None, name: str, sizes_px: Mapping[str, Sequence[int]]) -> list[list[bool]]:
-    """For each cell whether its middle lies in the outline where the board should go; empty where nothing tells."""
+    """For each cell whether its middle lies in the outline where the board should go; empty where that is unknown."""
     if next_move is None or next_move.get("camera") != name or name not in sizes_px:
         return []
     outline = next_move.get("outline_px") or []
@@ -351,7 +351,7 @@ def walk(
     exposure_s: float | None,
     board_shape: str = "auto",
 ) -> None:
-    """Walk through a session, by a person's hand or by the positioner. Ctrl-C leaves it to be taken up again.
+    """Walk through a session, with a person or the positioner. Ctrl-C leaves it to be resumed.
 
     Raises
     ------
@@ -415,7 +415,7 @@ class Walk:
         ServiceError
             The service refused, or is gone. The session is kept.
         """
-        self._stand()
+        self._show_coverage()
         while True:
             self._console.print()
             answer = answered(f"{_KEYS} > ", self._console)
@@ -425,22 +425,22 @@ class Walk:
                 if answer == "":
                     pose = self._shot(self._client.post(f"{self._path}/pose", {**self._exposure, "if_busy": "queue"}))
                     # A pose that was not taken in changes nothing: what to do next is enough.
-                    self._stand(picture=pose["accepted"] is True)
+                    self._show_coverage(picture=pose["accepted"] is True)
                 elif answer == "s":
                     self._solve()
                     if self._offer_activation():
                         return
                 elif answer == "d":
                     self._drop_last()
-                    self._stand()
+                    self._show_coverage()
                 else:
                     self._console.print(f"There is nothing on '{answer}'.", markup=False)
             except (ServiceError, PoseRefusedError, SolveRefusedError) as error:
                 self._console.print(Text(str(error), style="red"))
-        self.tell_how_to_go_on()
+        self.print_how_to_resume()
 
     def by_script(self, *, positions: Sequence[str], activate: bool) -> None:
-        """Have the positioner take its poses, tell each, solve, and if asked have scans use the result.
+        """Shoot the poses of the positioner, print each, solve, and if `activate` use the result for scans.
 
         Raises
         ------
@@ -452,37 +452,37 @@ class Walk:
         request = {"positions": list(positions), **self._exposure, "if_busy": "queue"}
         pose: Mapping[str, Any] | None = self._client.post(f"{self._path}/script", request)
         while pose is not None:
-            told = self._shot(pose)
-            if told["state"] in {"failed", "interrupted"} and told["accepted"] is None:
-                message = f"{told['name']}: {told['error']['detail']}"
+            shown = self._shot(pose)
+            if shown["state"] in {"failed", "interrupted"} and shown["accepted"] is None:
+                message = f"{shown['name']}: {shown['error']['detail']}"
                 raise ServiceError(message)
-            if told["state"] == "cancelled":
+            if shown["state"] == "cancelled":
                 break
-            pose = self._following(told)
-        self._stand()
+            pose = self._following(shown)
+        self._show_coverage()
         self._solve()
         if activate:
             self._activate()
 
-    def tell_how_to_go_on(self) -> None:
-        """Say how the walk is taken up again."""
+    def print_how_to_resume(self) -> None:
+        """Print how to resume the walk."""
         self._console.print(
             f"The session is kept. Take it up again with: slrig calibrate run --id {self._id[:8]}", markup=False
         )
 
     def leave(self) -> None:
-        """Have what is under way end early: the service darkens the projector. Nothing is raised."""
+        """Cancel the poses under way: the service darkens the projector. Nothing is raised."""
         with suppress(ServiceError):
             for pose in self._session()["shot"]:
                 if pose["state"] not in FINAL:
                     self._client.post(pose["links"]["cancel"], None)
-        self.tell_how_to_go_on()
+        self.print_how_to_resume()
 
     def _session(self) -> dict[str, Any]:
         return self._client.get(self._path)
 
     def _shot(self, pose: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Follow a pose to its end, and tell what was found of it."""
+        """Follow a pose to its end, and print its findings."""
         with progress_shown() as display:
             while pose["state"] not in FINAL:
                 progress = self._session().get("progress") or {}
@@ -491,7 +491,7 @@ class Walk:
                 time.sleep(_POLL_S)
                 pose = self._client.get(pose["links"]["self"])
             display(f"{pose['name']}: {outcome(pose)}", 1.0, "")
-        tell_pose(pose, self._console)
+        print_pose(pose, self._console)
         return pose
 
     def _following(self, pose: Mapping[str, Any]) -> Mapping[str, Any] | None:
@@ -505,8 +505,8 @@ class Walk:
                 return None
             time.sleep(_POLL_S)
 
-    def _stand(self, *, picture: bool = True) -> None:
-        """Show what is covered, and what to do next."""
+    def _show_coverage(self, *, picture: bool = True) -> None:
+        """Show the coverage, and the next step."""
         session = self._session()
         if session["coverage"] is None:
             light = " and the projector's light falls on it" if session["patterns"]["codes"] else ""
@@ -516,7 +516,7 @@ class Walk:
         if picture:
             self._console.print(coverage_picture(session["coverage"], session["next_move"], self._sizes_px()))
             self._console.print()
-        tell_next(session["next_move"], self._console)
+        print_next_move(session["next_move"], self._console)
 
     def _sizes_px(self) -> dict[str, Sequence[int]]:
         return {camera["name"]: camera["size_px"] for camera in self._client.get("/rig")["cameras"]}
@@ -530,7 +530,7 @@ class Walk:
         self._console.print(f"{shot[-1]['name']} is dropped.", markup=False)
 
     def _solve(self) -> None:
-        """Solve and tell the result. Raises SolveRefusedError where the poses do not allow it."""
+        """Solve and print the result. Raises SolveRefusedError where the poses do not allow it."""
         session = self._client.post(f"{self._path}/solve", {"board_shape": self._board_shape})
         with progress_shown() as display:
             while session["state"] == "solving":
@@ -542,18 +542,18 @@ class Walk:
         if session["state"] != "solved":
             raise SolveRefusedError(session["error"]["detail"])
         self._console.print()
-        tell_result({**session["result"], "refused": refused(session)}, self._console)
+        print_result({**session["result"], "refused": refused(session)}, self._console)
         self._console.print()
         self._console.print(f"report: slrig calibrate export {self._id[:8]} report.html", markup=False, style="dim")
 
     def _offer_activation(self) -> bool:
         """Ask what to do with a solved calibration; True when the walk is over."""
-        keys = "[bold]a[/bold] have scans use it   [bold]Enter[/bold] shoot more   [bold]q[/bold] leave > "
+        keys = "[bold]a[/bold] use it for scans   [bold]Enter[/bold] shoot more   [bold]q[/bold] leave > "
         answer = answered(keys, self._console)
         if answer == "a":
             self._activate()
         elif answer == "q":
-            self.tell_how_to_go_on()
+            self.print_how_to_resume()
         return answer in {"a", "q"}
 
     def _activate(self) -> None:
@@ -561,11 +561,11 @@ class Walk:
         self._console.print("Scans use this calibration from now on.", style="green")
 
 
-def tell_pose(pose: Mapping[str, Any], console: Console) -> None:
-    """Print what was found of one pose: a line of figures per camera, then warnings, or why it was refused."""
-    words = outcome(pose)
-    colour = {"accepted": "green", "refused": "red", "failed": "red"}.get(words, "yellow")
-    console.print(Text.assemble((pose["name"], "bold"), " ", (words, f"bold {colour}")))
+def print_pose(pose: Mapping[str, Any], console: Console) -> None:
+    """Print the findings of one pose: a line of figures per camera, then warnings, or why it was refused."""
+    found = outcome(pose)
+    colour = {"accepted": "green", "refused": "red", "failed": "red"}.get(found, "yellow")
+    console.print(Text.assemble((pose["name"], "bold"), " ", (found, f"bold {colour}")))
     table = Table.grid(padding=(0, 2))
     answer = pose["answer"] or {}
     for camera, corners in (answer.get("corners_found") or {}).items():
@@ -580,7 +580,7 @@ def tell_pose(pose: Mapping[str, Any], console: Console) -> None:
 
 def _facts(answer: Mapping[str, Any], camera: str, corners: int) -> list[str]:
     facts = [f"{corners} of {answer['corners_expected']} corners"]
-    for key, words in (
+    for key, form in (
         ("tilt_deg", "{:.0f}° tilted"),
         ("distance_mm", "{:.0f} mm away"),
         ("sharpness_px", "edges {:.1f} px soft"),
@@ -588,7 +588,7 @@ def _facts(answer: Mapping[str, Any], camera: str, corners: int) -> list[str]:
     ):
         value = (answer.get(key) or {}).get(camera)
         if value is not None:
-            facts.append(words.format(value))
+            facts.append(form.format(value))
     saturated = (answer.get("saturated") or {}).get(camera)
     if saturated:
         facts.append(f"{saturated:.1%} saturated")

@@ -53,34 +53,34 @@ def patterns(
     rig: RigFile,
     sequence: Annotated[
         Literal["fast", "standard", "robust", "phase"] | None,
-        typer.Option(help="If scans ask for another than the rig file."),
+        typer.Option(help="If scans use another one than the rig file."),
     ] = None,
     period_px: Annotated[
-        int | None, typer.Option(help="Distance of two lines, or period of phase, if scans ask for another one.")
+        int | None, typer.Option(help="Distance of two lines, or period of phase, if scans use another one.")
     ] = None,
-    steps: Annotated[int | None, typer.Option(help="Frames of a sinusoid, if scans ask for other ones.")] = None,
-    line_width_px: Annotated[int | None, typer.Option(help="Width of a line, if scans ask for another one.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Frames of a sinusoid, if scans use another number.")] = None,
+    line_width_px: Annotated[int | None, typer.Option(help="Width of a line, if scans use another one.")] = None,
     gray_cell_px: Annotated[
-        int | None, typer.Option(help="Width of the finest Gray cell, if scans ask for another one.")
+        int | None, typer.Option(help="Width of the finest Gray cell, if scans use another one.")
     ] = None,
 ) -> None:
     """Write the patterns that a projector must hold.
 
     For trigger boxes and light engines: all that scans, calibration, verification and the doctor show, each once.
     """
-    asked = given(
+    changed = given(
         sequence=sequence, line_width_px=line_width_px, gray_cell_px=gray_cell_px, sine_steps=steps,
         **period_option(sequence, period_px),
     )  # fmt: skip
-    typer.echo(written_patterns(rig, asked))
+    typer.echo(written_patterns(rig, changed))
 
 
-def written_patterns(rig_file: Path, asked: Mapping[str, object]) -> str:
-    """Have the rig's projector write all that is shown on it, and return what to do with the files.
+def written_patterns(rig_file: Path, changed: Mapping[str, object]) -> str:
+    """Make the rig's projector write all of its patterns, and return what to do with the files.
 
-    asked : patterns of scans, as far as they differ from the rig file's. Scans of either axis can be played, before and
-    after a calibration. Raises UnsupportedByDeviceError where the projector shows any pattern, what opening the rig and
-    what writing raises.
+    changed : patterns of scans, as far as they differ from the rig file's. Scans of either axis can be played, before
+    and after a calibration. Raises UnsupportedByDeviceError where the projector shows any pattern; as opening the rig
+    and writing.
     """
     from dataclasses import replace
 
@@ -97,7 +97,7 @@ def written_patterns(rig_file: Path, asked: Mapping[str, object]) -> str:
 
     set_up_console_logs()
     config = read_rig(rig_file)
-    request = ScanRequest(patterns=PatternRequest.model_validate(asked))
+    request = ScanRequest(patterns=PatternRequest.model_validate(changed))
     with open_rig(config) as rig:
         projector = rig.projector
         if not isinstance(projector, StoredPatternProjector):
@@ -121,7 +121,7 @@ def import_images(
     projector: Annotated[str, typer.Option(help="Columns x rows of the projector, as 1024x768.")],
     program: Annotated[
         Literal["opencv", "scan3d", "slstudio", "slstudio-micro"] | None,
-        typer.Option("--format", help="The program whose order numbered images have. Default: opencv."),
+        typer.Option("--format", help="The program that set the order of numbered images. Default: opencv."),
     ] = None,
     pattern: Annotated[
         str | None,
@@ -137,7 +137,7 @@ def import_images(
             metavar="TEMPLATE",
             help="Names of images, as '{axis}_{bit:02}_{inverted}.png': fields axis, bit (0 the most significant) or "
             "power (0 the least), inverted, camera; or '*_{number}_{camera}.png': * is anything, {number} the order, "
-            "and the images tell their patterns.",
+            "and the images show their patterns.",
         ),
     ] = None,
     white: Annotated[
@@ -182,15 +182,15 @@ def import_images(
 ) -> None:
     """Make a bundle of another program's images.
 
-    The images themselves tell which Gray codes, lines and sinusoids they show; a picture beside the bundle shows what
-    each was taken for. Or state the order of a program, or names. Then: slrig reconstruct.
+    The Gray codes, lines and sinusoids are recognised in the images; a picture next to the bundle shows the result for
+    each. Or state the order of a program, or names. Then: slrig reconstruct.
     """
     from slrig.importers import ImageNaming, ProjectorCode, assign_images, import_capture, parse_size, write_list
 
     ways = {"--format": program, "--pattern": pattern, "--names": names, "--list": listed}
-    asked = [way for way, value in ways.items() if value is not None]
-    if len(asked) > 1 or ((white or black) and names is None):
-        message = f"expected one of {', '.join(ways)}, and --white and --black with --names, found {', '.join(asked)}"
+    named = [way for way, value in ways.items() if value is not None]
+    if len(named) > 1 or ((white or black) and names is None):
+        message = f"expected one of {', '.join(ways)}, and --white and --black with --names, found {', '.join(named)}"
         raise ConfigError(message)
     if program is not None and program != "opencv" and (cell_px, offset_px) != (None, None):
         message = (
@@ -218,18 +218,18 @@ def import_images(
         some = ", ".join(found.unassigned[:5]) + (" …" if len(found.unassigned) > 5 else "")
         typer.echo(f"{'left out':<11}{len(found.unassigned)} images that no pattern is known of: {some}")
     typer.echo(f"{'bundle':<11}{output}")
-    words = ["slrig", "reconstruct", str(output), "--output", f"{output.name}-mesh"]
-    words += [] if used is not None else ["--decode-only"]
+    command = ["slrig", "reconstruct", str(output), "--output", f"{output.name}-mesh"]
+    command += [] if used is not None else ["--decode-only"]
     typer.echo(f"{'calibrated':<11}{used or 'no: it can only be decoded'}")
     for note in found.calibration_notes:
         typer.echo(f"{'':<11}{note}")
-    typer.echo(f"To go on: {shlex.join(words)}")
+    typer.echo(f"To go on: {shlex.join(command)}")
 
 
 def _propose(found: UnderstoodFolder, sheet: Path, *, yes: bool) -> None:
-    """Print and draw which pattern each image was found to show, and ask whether to go on.
+    """Print and draw the pattern recognised in each image, and ask whether to go on.
 
-    Raises ConfigError: there are doubts, and no terminal to ask at.
+    Raises ConfigError: there are doubts, and no terminal for the question.
     """
     from slrig.cli.rig_file import terminal
     from slrig.importers import write_contact_sheet
@@ -239,7 +239,7 @@ def _propose(found: UnderstoodFolder, sheet: Path, *, yes: bool) -> None:
         typer.echo(f"{'found':<11}{fact}")
     for doubt in found.doubts:
         typer.echo(f"{'unsure':<11}{doubt}")
-    typer.echo(f"{'look at':<11}{sheet}")
+    typer.echo(f"{'check':<11}{sheet}")
     if yes:
         return
     if terminal():
@@ -247,7 +247,7 @@ def _propose(found: UnderstoodFolder, sheet: Path, *, yes: bool) -> None:
             raise typer.Exit(1)
     elif found.doubts:
         message = (
-            f"it is unsure what the images show: {'; '.join(found.doubts)}. Look at {sheet}; if it is right, add "
+            f"it is unsure what the images show: {'; '.join(found.doubts)}. Check {sheet}; if it is right, add "
             "--yes; otherwise describe the images by --format, --pattern, --names or --list"
         )
         raise ConfigError(message)
@@ -282,7 +282,7 @@ app = typer.Typer(
 )
 
 
-def _tell_version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
@@ -293,10 +293,10 @@ def _tell_version(wanted: bool) -> None:
 @app.callback()
 def slrig(
     _version: Annotated[
-        bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Show the version and exit.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
     ] = False,
 ) -> None:
-    """Options that stand before any command; what `slrig --help` says is `app`'s."""
+    """Options before any command; the text of `slrig --help` is `app`'s."""
 
 
 @app.command()
@@ -346,7 +346,7 @@ def scan(
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite files of an earlier scan in --output.")] = False,
-    asked: ScanOptions,
+    scan_options: ScanOptions,
     exposure_s: Annotated[
         list[float] | None,
         typer.Option(help="Exposure of every camera, seconds; repeated, a bracket for what is dark here, shiny there."),
@@ -366,7 +366,7 @@ def scan(
     gray_cell_px: Annotated[int | None, typer.Option(help="Width of the finest Gray cell, projector pixels.")] = None,
     gray_only: Annotated[bool, typer.Option("--gray-only", help="Play the Gray code without shifted lines.")] = False,
     rows: Annotated[
-        bool, typer.Option("--rows", help="Play columns and rows. Default: the axis the calibration asks for.")
+        bool, typer.Option("--rows", help="Play columns and rows. Default: the axis that the calibration needs.")
     ] = False,
     cross_lines: Annotated[
         bool,
@@ -381,7 +381,7 @@ def scan(
     rig: RigOption = None,
 ) -> None:
     """Scan with a running service, and fetch the mesh."""
-    from slrig.cli.scan import FILES, assisted, client_of, refuse_earlier, scan_with, series_with, tell_result
+    from slrig.cli.scan import FILES, assisted, client_of, print_result, refuse_earlier, scan_with, series_with
 
     request = given(
         label=label,
@@ -389,7 +389,7 @@ def scan(
         exposure_s=exposure_s[0] if exposure_s and len(exposure_s) == 1 else None,
         exposures_s=exposure_s if exposure_s and len(exposure_s) > 1 else None,
         if_busy="queue" if queue else "reject",
-        **asked.asked(),
+        **scan_options.request(),
         repeat=repeat if repeat > 1 else None,
         every_s=every_s,
         patterns=given(
@@ -397,23 +397,23 @@ def scan(
             **period_option(sequence, period_px), line_shift=False if gray_only else None, rows=rows or None,
             cross_lines=cross_lines or None,
         ),
-        reconstruction={**mesh.asked(), **given(uncalibrated=guesses.asked())},
+        reconstruction={**mesh.request(), **given(uncalibrated=guesses.request())},
         robot_pose=mesh.flange(),
     )  # fmt: skip
     files = tuple(file or FILES)
-    if asked.budget_s is not None and not asked.assist:
+    if scan_options.budget_s is not None and not scan_options.assist:
         raise ConfigError("--budget-s: it is for --assist, which finds exposures within it. Give both, or neither.")
     if output is None:
         output = Path("scans") / f"{datetime.now().astimezone():%Y-%m-%d-%H%M%S}"
     refuse_earlier(output, files, force=force)
     with client_of(rig, service) as client:
-        if asked.assist:
-            request = assisted(client, request, budget_s=asked.budget_s)
+        if scan_options.assist:
+            request = assisted(client, request, budget_s=scan_options.budget_s)
         if repeat > 1:
             series_with(client, request, output, files=files)
             return
         result = scan_with(client, request, output, files=files)
-    tell_result(result, output, files=files)
+    print_result(result, output, files=files)
 
 
 @app.command(cls=SubjectsCommand)
@@ -445,18 +445,18 @@ def reconstruct(
 ) -> None:
     """Make meshes from recorded scans. Needs no service and no rig."""
     with loading():
-        from slrig.cli.reconstruct import decode_and_tell, reconstruct_and_tell
+        from slrig.cli.reconstruct import decode_and_print, reconstruct_and_print
 
     if decode_only:
-        decode_and_tell(bundles, output)
+        decode_and_print(bundles, output)
         return
     options = mesh.chosen()
     if hand_eye is not None:
         from slrig.calibrate.hand_eye import read_hand_eye
 
         options["rig_in_base"] = read_hand_eye(hand_eye).rig_in_base(mesh.flange()).tolist()
-    reconstruct_and_tell(
-        bundles, output, calibration=calibration, further=file or (), options=options, guess=guesses.asked()
+    reconstruct_and_print(
+        bundles, output, calibration=calibration, further=file or (), options=options, guess=guesses.request()
     )
 
 
@@ -470,9 +470,9 @@ def devices(
 ) -> None:
     """List installed drivers and the devices that are plugged in."""
     if options is not None:
-        from slrig.cli.rig_file import tell_options
+        from slrig.cli.rig_file import print_options
 
-        tell_options(options, as_json=as_json)
+        print_options(options, as_json=as_json)
         return
     from slrig.cli.rig_file import list_devices
 
@@ -495,16 +495,16 @@ def init(
         list[str] | None,
         typer.Option("--set", metavar="TABLE.KEY=VALUE", help="An option of a camera or projector; may be repeated."),
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing; take all cameras that are plugged in.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Ask no questions; take all cameras that are plugged in.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file of --output.")] = False,
     example: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Write this example instead, as demo or webcams-and-hdmi, with its scene."),
     ] = None,
 ) -> None:
-    """Write a rig file for what is plugged in.
+    """Write a rig file for the devices that are plugged in.
 
-    Asks what it cannot know. Checks the file by the drivers before it is written; opens no device.
+    Asks for what it cannot know. Checks the file by the drivers before it is written; opens no device.
     """
     if example is not None:
         from slrig.cli.rig_file import write_example
@@ -569,7 +569,7 @@ def latency(
 ) -> None:
     """Flash the projector: how late is its light?
 
-    Tells whether the cameras have rolling shutters, too, and what to write into the rig file.
+    Shows whether the cameras have rolling shutters, too, and what to write into the rig file.
     """
     from slrig.cli.examine import latency as measure
 
@@ -639,14 +639,14 @@ def verify(
     position: Annotated[int | None, typer.Option(min=0, help="Pose of the rig's positioner, by number.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Look at the board once: does the calibration still hold?
+    """Shoot the board once: does the calibration still hold?
 
     Exit code 1 if it is stale.
     """
     from slrig.cli.calibrate_local import chosen_board
-    from slrig.cli.calibrate_local import verify as look
+    from slrig.cli.calibrate_local import verify as check
 
-    if not look(source, chosen_board(board), calibration, position=position, as_json=as_json):
+    if not check(source, chosen_board(board), calibration, position=position, as_json=as_json):
         raise typer.Exit(1)
 
 
@@ -666,7 +666,7 @@ def accept(
     scripted: Annotated[
         bool, typer.Option("--scripted", help="The rig's positioner places the artefacts; a rendered rig always can.")
     ] = False,
-    asked: AcceptanceOptions,
+    options: AcceptanceOptions,
     as_json: AsJson = False,
 ) -> None:
     """Test a rig with a sphere, a ball bar and a plane.
@@ -675,7 +675,7 @@ def accept(
     """
     from slrig.cli.accept import accept as test
 
-    if not test(rig, asked, output=output, scripted=scripted, as_json=as_json):
+    if not test(rig, options, output=output, scripted=scripted, as_json=as_json):
         raise typer.Exit(1)
 
 
@@ -717,7 +717,7 @@ def import_preset(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A file that export wrote; - is standard input.")],
     service: ServiceOptions,
 ) -> None:
-    """Have the service keep a preset by this name."""
+    """Store a preset in the service by this name."""
     from slrig.bundle import read_text
 
     document = sys.stdin.read(MOST_BYTES) if str(file) == "-" else read_text(file, MOST_BYTES, ConfigError)
@@ -777,11 +777,11 @@ def _with_only(name: str) -> typer.Typer:
 def main() -> None:
     """Run the command that the arguments name."""
     # Before numpy is loaded, here and in what commands start. OpenBLAS's threads wait for work by spinning, for 2**26
-    # ticks after each product (its THREAD_TIMEOUT), beside kernels, captures and other programs.
+    # ticks after each product (its THREAD_TIMEOUT), next to kernels, captures and other programs.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Before pydantic is loaded, which else reads the metadata of all packages: slrig uses no plug-in of pydantic's.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-    # A reader that has seen enough (slrig devices | head) closes the pipe: that is no error.
+    # A reader that has enough (slrig devices | head) closes the pipe: that is not an error.
     try:
         _with_only(sys.argv[1] if len(sys.argv) > 1 else "")(prog_name="slrig")
     except BrokenPipeError:

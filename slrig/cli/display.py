@@ -1,4 +1,4 @@
-"""What commands show: progress, a bar on a terminal and a line per stage elsewhere; tables; JSON."""
+"""Output of commands: progress, a bar on a terminal and a line per stage elsewhere; tables; JSON."""
 
 from __future__ import annotations
 
@@ -28,14 +28,13 @@ from slrig.jobs.listener import PREPARING
 from slrig.printable import printable
 
 _FIRST_SHARE = 0.2
-"""Of the work, before which nothing is said of the time that is left."""
+"""Share of the work before which the remaining time is not shown."""
 EVERY_S = 2.0
-"""How often a line tells of a stage that goes on, where there is no bar."""
+"""Interval of lines about a stage that goes on, where there is no bar."""
 
 
 def time_left(elapsed_s: float, fraction: float, stage: str = "") -> str:
-    """How long work will go on, by what it took so far; "" before a fifth is done, at the end, and while kernels are
-    compiled.
+    """The remaining time, by the time so far; "" before a fifth is done, at the end, and while kernels are compiled.
 
     >>> time_left(10.0, 0.1), time_left(10.0, 0.25), time_left(100.0, 0.4)
     ('', 'about 30 s left', 'about 2 min 30 s left')
@@ -50,15 +49,15 @@ class _TimeLeft(ProgressColumn):
     """See `time_left`."""
 
     def render(self, task: Task) -> Text:
-        """Return the words of now."""
+        """Return the remaining time as text."""
         return Text(time_left(task.elapsed or 0.0, task.completed / (task.total or 1.0), task.description))
 
 
 class ProgressDisplay:
-    """Told the stage, the fraction done and a detail; shows them on stderr.
+    """Shows the stage, the fraction done and a detail on stderr.
 
-    Where there is no terminal it prints a line for each stage, and another every `every_s` while one goes on, even if
-    nothing more is told: one kernel may take ten seconds to compile.
+    Where there is no terminal it prints a line for each stage, and another every `every_s` while one goes on, even
+    without a report: one kernel may take ten seconds to compile.
     """
 
     def __init__(self, stream: TextIO, *, every_s: float = EVERY_S) -> None:
@@ -78,8 +77,8 @@ class ProgressDisplay:
             )
             self._task = self._bar.add_task("", total=1.0, detail="")
         self._now = ("beginning", 0.0, "")
-        self._began_s = self._told_s = time.monotonic()
-        self._telling = threading.Lock()
+        self._began_s = self._printed_s = time.monotonic()
+        self._printing = threading.Lock()
         self._ended = threading.Event()
         self._repeating = threading.Thread(target=self._repeat, name="slrig-progress", daemon=True)
 
@@ -104,20 +103,20 @@ class ProgressDisplay:
             shown = detail if len(detail) <= 32 else f"{detail[:31]}…"
             self._bar.update(self._task, description=stage, completed=fraction, detail=shown)
             return
-        with self._telling:
+        with self._printing:
             begun = stage != self._now[0]
             self._now = (stage, fraction, detail)
             if begun:
                 self._print()
 
-    def error(self, words: str) -> None:
+    def error(self, message: str) -> None:
         """Print an error that does not end the work: it stays, above the bar where there is one."""
-        safe = "\n".join(map(printable, words.rstrip().split("\n")))
+        safe = "\n".join(map(printable, message.rstrip().split("\n")))
         if self._bar is not None:
             # The terminal breaks lines by itself, so that paths can be copied.
             self._bar.console.print(Text.assemble(("error: ", "bold red"), safe), soft_wrap=True)
             return
-        with self._telling:
+        with self._printing:
             print(f"error: {safe}", file=self._stream, flush=True)
             # What comes next may begin with the stage that failed.
             self._now = ("", *self._now[1:])
@@ -125,19 +124,19 @@ class ProgressDisplay:
     def _repeat(self) -> None:
         wait_s = self._every_s
         while not self._ended.wait(wait_s):
-            with self._telling:
-                wait_s = self._told_s + self._every_s - time.monotonic()
+            with self._printing:
+                wait_s = self._printed_s + self._every_s - time.monotonic()
                 if wait_s <= 0:
                     self._print()
                     wait_s = self._every_s
 
     def _print(self) -> None:
-        self._told_s = time.monotonic()
+        self._printed_s = time.monotonic()
         stage, fraction, detail = self._now
-        line = f"{self._told_s - self._began_s:6.1f} s  {fraction:4.0%}  {stage}"
-        left = time_left(self._told_s - self._began_s, fraction, stage)
-        words = ", ".join(each for each in (detail, left) if each)
-        print(f"{line:<40}{words}".rstrip(), file=self._stream, flush=True)
+        line = f"{self._printed_s - self._began_s:6.1f} s  {fraction:4.0%}  {stage}"
+        left = time_left(self._printed_s - self._began_s, fraction, stage)
+        more = ", ".join(each for each in (detail, left) if each)
+        print(f"{line:<40}{more}".rstrip(), file=self._stream, flush=True)
 
 
 @contextmanager
@@ -152,7 +151,7 @@ def progress_shown() -> Iterator[ProgressDisplay]:
 
 
 def plain_table(*heads: Column | str, **options: Any) -> Table:
-    """A table without lines, made flush with what stands above it. options : of `rich.table.Table`."""
+    """A table without lines, flush with the text above it. options : of `rich.table.Table`."""
     return Table(*heads, box=None, pad_edge=False, header_style="bold", **options)
 
 
@@ -165,7 +164,7 @@ def print_table(heads: Sequence[Column | str], rows: Iterable[Sequence[Text | st
 
 
 def print_json(document: Any) -> None:
-    """Print what `--json` asks for."""
+    """Print a document for `--json`."""
     # A line end here is one of the layout; JSON escapes those of the texts, but not all that a terminal acts on.
     lines = json.dumps(document, indent=2, ensure_ascii=False).split("\n")
     typer.echo("\n".join(map(printable, lines)))
@@ -181,7 +180,7 @@ def counted(count: int, what: str) -> str:
 
 
 def answered(prompt: str, console: Console | None = None) -> str:
-    """What a person typed, in lower case; "q" for the end of input and "quit". console : prints the prompt."""
+    """Input of a person, in lower case; "q" for the end of input and "quit". console : prints the prompt."""
     try:
         answer = (input(prompt) if console is None else console.input(prompt)).strip().lower()
     except EOFError:
@@ -190,7 +189,7 @@ def answered(prompt: str, console: Console | None = None) -> str:
 
 
 def quality_lines(summary: Mapping[str, Any]) -> list[str]:
-    """What a report's summary says about the frames, the mesh and its error, one line each."""
+    """A report's summary of the frames, the mesh and its error, one line each."""
     lines = []
     if summary.get("identity") is not None:
         lines.append(f"{'frames':<10}{summary['identity']}")
@@ -201,22 +200,20 @@ def quality_lines(summary: Mapping[str, Any]) -> list[str]:
     sigma = (mesh.get("sigma_mm") or {}).get("p50")
     if sigma is not None:
         holds = mesh.get("sigma_holds")
-        words = "" if holds is None else f"; {holds}"
-        lines.append(f"{'stated':<10}standard deviation of a point {sigma:.4f} mm (median){words}")
+        shown = "" if holds is None else f"; {holds}"
+        lines.append(f"{'stated':<10}standard deviation of a point {sigma:.4f} mm (median){shown}")
     truth = summary.get("truth") or {}
     if truth:
         lines.append(f"{'error':<10}{_error(truth)}")
-    return lines + [f"{'note':<10}{words}" for words in summary.get("notes") or []]
+    return lines + [f"{'note':<10}{note}" for note in summary.get("notes") or []]
 
 
 def _error(truth: Mapping[str, Any]) -> str:
-    """The error against the known truth: of what is near it, and how much is not."""
+    """The error against the known truth: of the area near it, and the share beyond."""
     rms_mm, beyond, complete = (truth.get(name) for name in ("rms_mm", "gross_fraction", "complete_0.3mm"))
-    words = "nothing within 1 mm of the known truth"
+    text = "nothing within 1 mm of the known truth"
     if rms_mm is not None:
-        words = f"rms {rms_mm:.4f} mm against the known truth"
+        text = f"rms {rms_mm:.4f} mm against the known truth"
         # Reports of earlier versions have the error alone.
-        words += (
-            "" if beyond is None else f", of the {1 - beyond:.1%} of the area within 1 mm; {beyond:.1%} beyond 1 mm"
-        )
-    return words if complete is None else f"{words}, {complete:.1%} of the visible surface within 0.3 mm"
+        text += "" if beyond is None else f", of the {1 - beyond:.1%} of the area within 1 mm; {beyond:.1%} beyond 1 mm"
+    return text if complete is None else f"{text}, {complete:.1%} of the visible surface within 0.3 mm"

@@ -62,15 +62,15 @@ def doctor(
     data: Path | None,
     as_json: bool,
 ) -> bool:
-    """Examine a rig, print what was found, write the new rig file, and return whether there is no fault.
+    """Examine a rig, print the findings, write the new rig file, and return whether there is no fault.
 
-    rig_file : of the rig, which is opened here, and what was found is kept in the data folder; None for the rig of the
+    rig_file : of the rig, which is opened here, with its findings kept in the data folder; None for the rig of the
     service. Raises SlrigError: a rig file is wrong or cannot be written, or the rig cannot be opened; ServiceError.
     """
     set_up_console_logs()
     if output is not None:
         if rig_file is None:
-            message = "--output: the new rig file is the old one with what was measured. Name the old one, too."
+            message = "--output: the new rig file is the old one with the measured values. Name the old one, too."
             raise ConfigError(message)
         refuse_existing(output, force=force)
     found, _ = _examined(rig_file, client, data, DoctorJob.kind, {"search_s": search_s})
@@ -112,7 +112,7 @@ def latency(
     data: Path | None,
     as_json: bool,
 ) -> None:
-    """Measure a rig's latency, and print it in words with the table for its rig file, or as JSON. See `doctor`."""
+    """Measure a rig's latency, and print it as text with the table for its rig file, or as JSON. See `doctor`."""
     set_up_console_logs()
     options = given(flashes=flashes, search_s=search_s, exposure_s=exposure_s, trigger=trigger)
     found, _ = _examined(rig_file, client, data, LatencyJob.kind, options)
@@ -120,7 +120,7 @@ def latency(
         print_json(found)
         return
     synchronisation, cameras = latency_from_document(found)
-    typer.echo("\n\n".join(f"camera {name}\n{_latency_words(each)}" for name, each in cameras.items()))
+    typer.echo("\n\n".join(f"camera {name}\n{_latency_text(each)}" for name, each in cameras.items()))
     place = "the rig file" if rig_file is None else rig_file
     typer.echo(f"\nPut this into {place}, in place of a table of that name:\n\n{_rig_table(synchronisation)}")
 
@@ -175,7 +175,7 @@ def _keep(data: Path | None, kind: JobKind, found: Mapping[str, Any]) -> None:
         typer.echo(f"the service will not show this: {error}", err=True)
         return
     if not there and data is not None:
-        typer.echo(f"the service will not show this: {folder} is no data folder of slrig serve", err=True)
+        typer.echo(f"the service will not show this: {folder} is not a data folder of slrig serve", err=True)
 
 
 def _print_diagnosis(diagnosis: Diagnosis, console: Console, *, rig_file: Path | None, output: Path | None) -> None:
@@ -185,10 +185,10 @@ def _print_diagnosis(diagnosis: Diagnosis, console: Console, *, rig_file: Path |
         show_header=False,
     )  # fmt: skip
     for finding in diagnosis.findings:
-        told = f"{escape(finding.subject)}: {escape(finding.found)}"
+        text = f"{escape(finding.subject)}: {escape(finding.found)}"
         if finding.remedy:
-            told += f"\n[bold]do[/bold] {escape(finding.remedy)}"
-        table.add_row(_coloured(finding.severity), f"{told}  [dim]({finding.name})[/dim]")
+            text += f"\n[bold]do[/bold] {escape(finding.remedy)}"
+        table.add_row(_coloured(finding.severity), f"{text}  [dim]({finding.name})[/dim]")
     console.print(table)
     faults, notes = len(diagnosis.with_severity(Severity.FAULT)), len(diagnosis.with_severity(Severity.NOTE))
     console.print(f"\n[bold]{_counted(faults, 'fault')}, {_counted(notes, 'note')}[/bold]")
@@ -204,10 +204,10 @@ def _print_report(report: ConformanceReport, console: Console) -> None:
     heads = (Column("result", no_wrap=True), Column("s", justify="right", no_wrap=True), Column("check"))
     table = Table(*heads, box=None, title=f"Conformance of rig '{escape(report.rig)}'", title_justify="left")
     for result in report.results:
-        told = escape(result.title)
+        text = escape(result.title)
         if result.outcome is CheckOutcome.NOT_APPLICABLE:
-            told += f"\n[dim]{escape(result.reason or '')}[/dim]"
-        table.add_row(_coloured(result.outcome), f"{result.seconds:.1f}", told)
+            text += f"\n[dim]{escape(result.reason or '')}[/dim]"
+        table.add_row(_coloured(result.outcome), f"{result.seconds:.1f}", text)
     console.print(table)
     for result in report.results:
         if (failure := result.failure) is not None:
@@ -257,7 +257,7 @@ def _number(value: float, *, digits: int = 6) -> str:
     return np.format_float_positional(value, digits, unique=False, trim="0")
 
 
-def _latency_words(found: CameraLatency) -> str:
+def _latency_text(found: CameraLatency) -> str:
     ms = {name: f"{seconds * 1e3:.2f} ms" for name, seconds in asdict(found).items() if name.endswith("_s")}
     line = f"{found.line_time_s * 1e6:.2f} ± {found.line_time_error_s * 1e6:.2f} µs from row to row"
     if found.rolling:
@@ -265,7 +265,7 @@ def _latency_words(found: CameraLatency) -> str:
     elif found.scanned:
         shutter = f"the projector builds up its picture row by row: {line}, as the camera sees it"
     else:
-        shutter = f"global shutter: {line}, not told from 0"
+        shutter = f"global shutter: {line}, not distinguishable from 0"
     said = [
         f"light comes {ms['latency_s']} ± {ms['standard_error_s']} after the instant the projector states",
         f"it varies by {ms['jitter_s']} (standard deviation), 95 % come within {ms['latency_p95_s']}; "
@@ -278,7 +278,7 @@ def _latency_words(found: CameraLatency) -> str:
     if found.late:
         said.append(found.late_words)
     if found.halfway_s:
-        said.append(f"between white and black it stands halfway for {ms['halfway_s']}: interpolated pictures")
+        said.append(f"between white and black it is halfway for {ms['halfway_s']}: interpolated pictures")
     if found.flicker > STEADY_TOLERANCE:
         said.append(f"steady white flickers by {found.flicker:.0%}: make the exposure a multiple of the refresh period")
     return "\n".join(f"  {line}" for line in said)

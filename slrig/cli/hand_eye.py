@@ -31,10 +31,10 @@ from slrig.logs import set_up_console_logs
 from slrig.scan.artefacts import MESH
 
 
-def seen_by_rig(
-    poses: Path, seen: Path, rotation: str | None, asked: BoardArguments, calibration: Path | None, sphere: float | None
+def observed_by_rig(
+    poses: Path, seen: Path, rotation: str | None, board: BoardArguments, calibration: Path | None, sphere: float | None
 ) -> tuple[SeenTargets, str | None]:
-    """The robot's poses and what the rig saw in them, and the identifier of the rig's calibration.
+    """The robot's poses with the rig's observations, and the identifier of the rig's calibration.
 
     Raises CalibrationError, BundleError, PoseRefusedError.
     """
@@ -71,7 +71,7 @@ def seen_by_rig(
         if of_rig is None or sphere is not None:
             given = seen_spheres(paired(robot, scans), scans, sphere or 0.0, report)
         else:
-            given = seen_boards(paired(robot, folders), folders, chosen_board(asked), of_rig, report)
+            given = seen_boards(paired(robot, folders), folders, chosen_board(board), of_rig, report)
         display("done", 1.0, "")
     return given, None if of_rig is None else of_rig.solve_id
 
@@ -79,7 +79,7 @@ def seen_by_rig(
 def solve_poses(
     given: SeenTargets, identifier: str | None, kind: str, robot: RobotOptions, output: Path, *, as_json: bool
 ) -> dict[str, Any]:
-    """Solve, write the file, print what it says, and return it. Raises SolveRefusedError, StorageError."""
+    """Solve, write the file, print and return it. Raises SolveRefusedError, StorageError."""
     found = solve_hand_eye(given.robot, given.seen, HandEyeKind(kind), robot_sigma=robot.robot_sigma)
     document = hand_eye_document(
         found, identifier, base_frame=robot.base_frame, flange_frame=robot.flange_frame, refused=given.refused
@@ -114,7 +114,7 @@ def solve_poses(
 
 
 def check_poses(given: SeenTargets, identifier: str | None, file: Path, *, as_json: bool) -> bool:
-    """Print how far new poses are from a hand-eye calibration, and return whether it holds. Raises CalibrationError."""
+    """Print the drift of new poses from a hand-eye calibration; return whether it holds. Raises CalibrationError."""
     document = read_hand_eye(file)
     drift = check_hand_eye(hand_eye_of(document), given.robot, given.seen)
     other = document.calibration != identifier and None not in (document.calibration, identifier)
@@ -131,9 +131,9 @@ def check_poses(given: SeenTargets, identifier: str | None, file: Path, *, as_js
         })  # fmt: skip
         return drift.holds
     console = Console(highlight=False)
-    words = "[green]holds[/green]" if drift.holds else "[bold red]drifted[/bold red]"
+    result = "[green]holds[/green]" if drift.holds else "[bold red]drifted[/bold red]"
     console.print(
-        f"{words}: as if the rig had moved by {drift.shift_mm:.3f} ± {drift.sigma_mm:.3f} mm and {drift.turn_deg:.3f} "
+        f"{result}: as if the rig had moved by {drift.shift_mm:.3f} ± {drift.sigma_mm:.3f} mm and {drift.turn_deg:.3f} "
         f"± {drift.sigma_deg:.3f}°; so much by chance: {drift.probability:.2g}"
     )
     for name, mm, degrees in rows:
@@ -141,10 +141,10 @@ def check_poses(given: SeenTargets, identifier: str | None, file: Path, *, as_js
     for name, why in given.refused.items():
         console.print(f"[yellow]not used[/yellow]  {escape(f'{name}: {why}')}")
     if other:
-        console.print("The rig was calibrated anew since: its own frame may have moved. Solve hand-eye again.")
+        console.print("The rig was calibrated again since: its own frame may have moved. Solve hand-eye again.")
     elif not drift.holds:
         console.print(
-            "do        look whether the rig, the target, or the tool that the robot reports changed since; then solve "
+            "do        check whether the rig, the target, or the tool that the robot reports changed since; then solve "
             "hand-eye again"
         )
     return drift.holds

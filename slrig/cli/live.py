@@ -86,7 +86,7 @@ def _show(frames: Iterable[LiveFrame], export: Path | None, seconds: float | Non
 
 
 def aim_line(facts: Mapping[str, Any], per_s: float) -> str:
-    """What a depth image says of the aim, on one line."""
+    """The aim by a depth image, on one line."""
     shares = facts["shares"]
     parts = [f"{per_s:4.1f}/s", f"measured {shares['measured']:.0%}"]
     shown = ("moved", "saturated", "dark", "unclear")

@@ -1,4 +1,4 @@
-"""How commands load what they need."""
+"""Loading of modules by commands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from contextlib import contextmanager
 def loading() -> Iterator[None]:
     """Import modules within the block, without a search for garbage: what they make stays.
 
-    To look through a hundred thousand objects takes a tenth of a second, now and in each later search.
+    A search of a hundred thousand objects takes a tenth of a second, now and each later time.
     """
     gc.disable()
     try:

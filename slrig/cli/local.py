@@ -25,8 +25,8 @@ from slrig.model import Calibration
 from slrig.rig.session import ActiveCalibration, RigSession
 from slrig.scan.job import PIPELINE
 
-_LOOK_S = 0.5
-"""How often a command looks how far the kernels are."""
+_CHECK_S = 0.5
+"""Interval at which a command checks the progress of the kernels."""
 
 
 @contextmanager
@@ -80,8 +80,8 @@ def followed(manager: JobManager, job_id: UUID, listener: Listener) -> JobRecord
                 listener.report("preparing", at.fraction, manager.worker.condition)
             else:
                 listener.report(at.stage, at.fraction, at.detail)
-            # What the worker loads is no event.
-            news.wait(_LOOK_S if preparing else None)
+            # Loading of the worker causes no event.
+            news.wait(_CHECK_S if preparing else None)
             news.clear()
     finally:
         unwatch()

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 Vector = tuple[float, float, float]
 _OFF_DEG = 5.0
-"""Between what is said of a turntable and what a scan's report says: more than turntables err by, less than views are
-apart.
+"""Largest difference between the stated angle of a turntable and that of a scan's report: more than the errors of
+turntables, less than the distance of views.
 """
 
 
@@ -57,7 +57,7 @@ def model(
             help="With --shoot: the rig file to shoot with; what the folder has of an earlier call stays.",
         ),
     ] = None,
-    manual: Annotated[bool, typer.Option("--manual", help="With --shoot: turn it yourself, when told.")] = False,
+    manual: Annotated[bool, typer.Option("--manual", help="With --shoot: turn it yourself, on request.")] = False,
     service: ServiceOptions,
     angle: Annotated[
         float | None,
@@ -88,10 +88,10 @@ def model(
         Path | None, typer.Option(metavar="FILE", help="Poses to start from, by the scans' names, as in poses.json.")
     ] = None,
     unknown: Annotated[
-        bool, typer.Option("--unknown", help="Nobody knows where the scans belong: find it from what they see.")
+        bool, typer.Option("--unknown", help="The poses of the scans are unknown: find them from the surfaces.")
     ] = False,
     markers: Annotated[
-        bool, typer.Option("--markers", help="ArUco markers that turn with the object tell where the scans belong.")
+        bool, typer.Option("--markers", help="Find the poses of the scans by ArUco markers that turn with the object.")
     ] = False,
     dictionary: Annotated[
         str | None, typer.Option(metavar="NAME", help="With --markers: OpenCV's name for theirs; else DICT_5X5_250.")
@@ -107,7 +107,7 @@ def model(
     """Make one mesh of scans of an object from several sides.
 
     Says how well they agree, and which motions their shape leaves open. The start is a turntable's angle, poses,
-    markers, or unknown. Where no scan has seen the object, the mesh is open.
+    markers, or unknown. Where no scan shows the object, the mesh is open.
     """
     from slrig.bundle import TurntableRecord, read_turntable
     from slrig.cli.display import progress_shown
@@ -127,41 +127,41 @@ def model(
     set_up_console_logs()
     keep_kernels()
     known, notes = TurntableRecord() if turntable is None else read_turntable(turntable), list[str]()
-    told = _axis(axis, axis_point, axis_direction)
-    if told is None and known.axis is not None and poses is None and not (unknown or markers):
-        told = StatedAxis.of(known.axis.point_mm, known.axis.direction)
+    stated = _axis(axis, axis_point, axis_direction)
+    if stated is None and known.axis is not None and poses is None and not (unknown or markers):
+        stated = StatedAxis.of(known.axis.point_mm, known.axis.direction)
     if (shoot is None) == (not scans) or (shoot is None and (rig or manual)):
         raise ConfigError("expected scans, or --shoot N (with --rig or a service, and --manual), and not both")
     if dictionary is not None and not markers:
-        raise ConfigError("--dictionary: expected --markers beside it, whose dictionary it is; leave it out")
+        raise ConfigError("--dictionary: expected --markers with it, for their dictionary; leave it out")
     found = MarkerPoses(dictionary or MARKER_DICTIONARY) if markers else UnknownPoses() if unknown else None
-    if found is not None and ((unknown and markers) or (shoot is not None and told is not None)):
+    if found is not None and ((unknown and markers) or (shoot is not None and stated is not None)):
         raise ConfigError(
-            "--markers and --unknown each find by themselves where scans belong: leave out the other one, and an axis"
+            "--markers and --unknown each find the poses of scans by themselves: leave out the other one, and an axis"
         )
     if shoot is None:
         files = _named_meshes(scans or ())
-        start = _starts(list(files), angle, told, poses, found)
+        start = _starts(list(files), angle, stated, poses, found)
         if angle is not None:
             _require_order(files, angle)
     elif angle is not None or poses is not None:
-        raise ConfigError("--shoot: it says itself where the views stand; leave --angle and --poses out")
+        raise ConfigError("--shoot: it sets the angles of the views itself; leave --angle and --poses out")
     elif rig is not None:
         from slrig.cli.model_shoot import views_here
 
-        files, start, notes = views_here(rig, shoot, output, manual=manual, axis=told, found=found)
+        files, start, notes = views_here(rig, shoot, output, manual=manual, axis=stated, found=found)
         output /= "model"
     else:
         from slrig.cli.model_shoot import views_there
 
         request = given(
             views=shoot, manual=manual, poses=None if found is None else found.kind, dictionary=dictionary,
-            axis=None if told is None else asdict(told), start_error_mm=start_error_mm, voxel_mm=voxel_mm,
+            axis=None if stated is None else asdict(stated), start_error_mm=start_error_mm, voxel_mm=voxel_mm,
             cut=not no_cut,
         )  # fmt: skip
         with service.client() as client:
             views_there(client, request, output)
-        _tell_all(json.loads((output / REPORT).read_bytes()), output)
+        _print_all(json.loads((output / REPORT).read_bytes()), output)
         return
     read = [each for each in (axis, poses, turntable) if each and each.name != POSES]
     _require_apart(output, [*files.values(), *read])
@@ -174,21 +174,21 @@ def model(
             planes=planes, notes=notes,
         )  # fmt: skip
         report = json.loads((folder / REPORT).read_bytes())
-    _tell_all(report, output)
+    _print_all(report, output)
 
 
-def _tell_all(report: Mapping[str, Any], output: Path) -> None:
+def _print_all(report: Mapping[str, Any], output: Path) -> None:
     from slrig.model_jobs.plan import MEDIA_TYPES
 
-    _tell(report)
-    _tell_fused(report["model"])
+    _print_alignment(report)
+    _print_fused(report["model"])
     for note in report["notes"]:
         typer.echo(f"{'note':<10}{note}")
     for name in MEDIA_TYPES:
         typer.echo(f"{name:<12}{output / name}")
 
 
-def _tell_fused(of: Mapping[str, Any]) -> None:
+def _print_fused(of: Mapping[str, Any]) -> None:
     once = of["seen_by"].get(1, 0.0)
     typer.echo(
         f"{'mesh':<10}{of['vertices']:,} vertices, {of['triangles']:,} triangles of {of['voxel_mm']:.2g} mm; σ "
@@ -197,7 +197,7 @@ def _tell_fused(of: Mapping[str, Any]) -> None:
     )
 
 
-def _tell(report: Mapping[str, Any]) -> None:
+def _print_alignment(report: Mapping[str, Any]) -> None:
     from rich.table import Column
 
     from slrig.cli.display import counted, print_table
@@ -228,7 +228,7 @@ def _tell(report: Mapping[str, Any]) -> None:
         who = counted(len({each["view"] for each in mine}), "view")
         limits_mm = [each["free_mm"] for each in mine if each["free_mm"] is not None]
         far = f"by {min(limits_mm):.2g} mm and more" if limits_mm else "without a limit"
-        typer.echo(f"{'free':<10}{who} may {mine[0]['words']} {far}: no surface tells, {holds}")
+        typer.echo(f"{'free':<10}{who} may {mine[0]['words']} {far}: no surface prevents it, {holds}")
     if (marked := report["markers"]) is not None:
         counts = [len(each["used"]) for each in marked]
         sigma_mm = max(each["sigma_mm"] for each in marked)
@@ -257,23 +257,23 @@ def _starts(
     file: Path | None,
     found: StartingPoses | None,
 ) -> StartingPoses:
-    """Where the scans start from. found : unknown, or by markers. Raises ConfigError: that is not told in one way
-    alone, or not of all scans.
+    """Start of the alignment. found : unknown, or by markers. Raises ConfigError: it is not given in exactly one way,
+    or not for all scans.
     """
     from slrig.bundle import read_poses
     from slrig.model_jobs.plan import GivenPoses, TurntablePoses
 
     ways = [angle is not None, file is not None, found is not None]
     if sum(ways) != 1 or (angle is None) != (axis is None):
-        told = {
+        ways_given = {
             "--angle": angle, "--axis, --axis-point or --turntable": axis, "--poses": file,
             "--unknown or --markers": found,
         }  # fmt: skip
-        said = ", ".join(way for way, value in told.items() if value is not None) or "none of them"
+        said = ", ".join(way for way, value in ways_given.items() if value is not None) or "none of them"
         message = (
             "expected a turntable's --angle with its axis (--turntable FILE, --axis FILE, or --axis-point and "
             f"--axis-direction), --poses FILE, --markers, or --unknown, found {said}. Where --unknown is refused, "
-            "place the scans by hand in another program, and write what it says into a file as "
+            "place the scans manually in another program, and write its poses into a file as "
             "slrig/multiview/README.md describes"
         )
         raise ConfigError(message)
@@ -297,8 +297,8 @@ def _require_order(files: Mapping[str, Path], angle: float) -> None:
     from slrig.scan.artefacts import REPORT
 
     reports = [mesh.with_name(REPORT) for mesh in files.values()]
-    told = [turntable_angle(report.read_bytes()) if report.is_file() else None for report in reports]
-    stood = [turntable[0] for turntable in told if turntable is not None]
+    recorded = [turntable_angle(report.read_bytes()) if report.is_file() else None for report in reports]
+    stood = [turntable[0] for turntable in recorded if turntable is not None]
     off = [math.remainder(each - stood[0] - angle * number, 360.0) for number, each in enumerate(stood)]
     if len(stood) == len(files) and max(map(abs, off)) > _OFF_DEG:
         where = ", ".join(f"{name} at {each:g}°" for name, each in zip(files, stood, strict=True))
@@ -311,7 +311,7 @@ def _require_order(files: Mapping[str, Path], angle: float) -> None:
 
 
 def _axis(file: Path | None, point: Vector | None, direction: Vector | None) -> StatedAxis | None:
-    """The axis that was told. Raises ConfigError: twice, by half, without a length, or `file` has none."""
+    """The stated axis. Raises ConfigError: it is given twice, by half, without a length, or `file` has none."""
     from slrig.bundle import read_poses
     from slrig.model_jobs.plan import StatedAxis
 
@@ -332,8 +332,8 @@ def _require_apart(output: Path, read: Sequence[Path]) -> None:
         raise ConfigError(f"--output {output}: {inside} lies in it and would be replaced; name another folder")
 
 
-def _named_meshes(asked: Sequence[Path]) -> dict[str, Path]:
-    """The mesh.ply that is meant by each argument, by the scan's name, in the order told; of a folder's, natural.
+def _named_meshes(paths: Sequence[Path]) -> dict[str, Path]:
+    """The mesh.ply of each argument, by the scan's name, in the given order; those of a folder in natural order.
 
     Raises ConfigError: there is none, fewer than two, or two of one name.
     """
@@ -342,7 +342,7 @@ def _named_meshes(asked: Sequence[Path]) -> dict[str, Path]:
     from slrig.scan.artefacts import MESH
 
     found: list[tuple[str, Path]] = []
-    for path in (each for one in asked for each in matching(one)):
+    for path in (each for one in paths for each in matching(one)):
         inside = [path / MESH] if (path / MESH).is_file() else sorted(path.glob(f"*/{MESH}"), key=natural_sort_key)
         if path.is_file():
             inside = [path]
@@ -358,23 +358,23 @@ def _named_meshes(asked: Sequence[Path]) -> dict[str, Path]:
     return dict(found)
 
 
-turntable_app = typer.Typer(no_args_is_help=True, help="A turntable's axis, its plate and what is behind.")
+turntable_app = typer.Typer(no_args_is_help=True, help="A turntable's axis, its plate and the background.")
 
 
 @turntable_app.command(cls=SubjectsCommand)
 @grouped
 def shoot(
     *,
-    asked: BoardArguments,
+    board_options: BoardArguments,
     first_deg: Annotated[float, typer.Option(help="Angle of the first shot.")] = -50.0,
     step_deg: Annotated[float, typer.Option(min=1.0, max=180.0, help="Turned by so much from shot to shot.")] = 20.0,
     count: Annotated[int, typer.Option(min=3, max=72, help="Shots. The cameras must see the board in them.")] = 6,
     exposure_s: Annotated[float | None, typer.Option(help="Exposure of every camera, seconds.")] = None,
     service: ServiceOptions,
 ) -> None:
-    """Have a running service turn a board, and measure the axis.
+    """Turn a board by a running service, and measure the axis.
 
-    The board stands on the turntable; scans and models use the axis from then on.
+    The board is on the turntable; scans and models use the axis from then on.
     """
     from slrig.cli.calibrate_local import chosen_board
     from slrig.cli.calibrate_walk import board_request
@@ -383,7 +383,7 @@ def shoot(
 
     with service.client() as client:
         job = client.turntable.shoot(
-            board=board_request(chosen_board(asked)), first_deg=first_deg, step_deg=step_deg, count=count,
+            board=board_request(chosen_board(board_options)), first_deg=first_deg, step_deg=step_deg, count=count,
             exposure_s=exposure_s,
         )  # fmt: skip
         with progress_shown() as display:
@@ -433,9 +433,9 @@ def _print_axis(
 @grouped
 def axis(
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="Bundles of a board that stood on the turntable, one per angle.")
+        Path, typer.Argument(metavar="FOLDER", help="Bundles of a board on the turntable, one per angle.")
     ],
-    asked: BoardArguments,
+    board_options: BoardArguments,
     calibration: Annotated[Path, typer.Option(metavar="FILE", help="The calibration of the rig.")],
     output: Annotated[
         Path, typer.Option(metavar="FILE", help="The turntable's file. One that is there keeps its planes.")
@@ -461,7 +461,7 @@ def axis(
     set_up_console_logs()
     bundles, board, rig, before = (
         pose_bundles(folder),
-        chosen_board(asked),
+        chosen_board(board_options),
         read_calibration(calibration),
         _known(output),
     )
@@ -534,7 +534,7 @@ def planes(
 
 
 def _known(file: Path) -> TurntableRecord:
-    """What the file says already. Raises ConfigError: it is damaged, and is left as it is."""
+    """The present content of the file. Raises ConfigError: it is damaged, and is left as it is."""
     from slrig.bundle import TurntableRecord, read_turntable
 
     return read_turntable(file) if file.exists() else TurntableRecord()

@@ -43,7 +43,7 @@ def views_here(
     found: StartingPoses | None = None,
 ) -> tuple[dict[str, Path], StartingPoses, list[str]]:
     """Shoot the views that `output` lacks, each into view-N with its frames in bundle-N. Return the meshes by name,
-    where they start from, and words for views that failed. Ctrl-C leaves what was shot.
+    the start of their alignment, and notes on views that failed. Ctrl-C leaves what was shot.
 
     axis : None for the turntable's own. found : unknown, or by markers: no angle and no axis is needed.
 
@@ -52,7 +52,7 @@ def views_here(
     ConfigError
         The rig file is wrong, or the axis is not known.
     UnsupportedByDeviceError
-        The rig has no turntable, and nobody turns by hand.
+        The rig has no turntable, and `manual` is not set.
     ViewsFailedError
         Fewer than two views succeeded.
     """
@@ -97,11 +97,11 @@ def views_here(
     ]
     if found is None and (len(turntables) < len(good) or len({turntable.count for turntable in turntables}) > 1):
         message = (
-            f"{output}: expected views whose angles have one zero, found some without one, or that the turntable lost "
+            f"{output}: expected angles of one zero in all views, found some without one, or that the turntable lost "
             "its place between them; shoot into another folder, or say --unknown"
         )
         raise ConfigError(message)
-    # As they were shot, perhaps by a command that asked for another number of views.
+    # As they were shot, perhaps by a command with another number of views.
     angles_deg = tuple(turntable.angle_deg for turntable in turntables)
     poses = TurntablePoses(axis, angles_deg) if found is None else found
     return {mesh.parent.name: mesh for mesh in good.values()}, poses, notes
@@ -123,8 +123,8 @@ def _shot(rig: Rig, plan: ScanPlan, output: Path, number: int) -> None:
 
 
 def views_there(client: Client, request: Mapping[str, Any], output: Path) -> None:
-    """Have a service shoot the views and make the model, and fetch its files into `output`. Ctrl-C cancels; scans that
-    were made stay with the service.
+    """Shoot the views and make the model by a service, and fetch its files into `output`. Ctrl-C cancels; finished
+    scans stay with the service.
 
     Raises ServiceError: it refused, is gone, or the model failed.
     """
@@ -148,7 +148,7 @@ def views_there(client: Client, request: Mapping[str, Any], output: Path) -> Non
                     else client.models.view(here, again=answer == "a", if_busy="queue")
                 )
     except (KeyboardInterrupt, ServiceError):
-        # Nobody would turn for it any more.
+        # The person would no longer turn the object for it.
         with suppress(ServiceError):
             client.models.cancel(here)
         raise

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from slrig.client import Client
 
 _NAMES = 30
-"""Width of the column of options' names; longer ones stand on a line of their own."""
+"""Width of the column of options' names; longer ones have a line of their own."""
 
 
 class SubjectsCommand(typer.core.TyperCommand):
@@ -31,18 +31,18 @@ class SubjectsCommand(typer.core.TyperCommand):
         """Write arguments, options without a subject, then the others subject by subject."""
         subjects: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
         for each in self.get_params(ctx):
-            words = each.get_help_record(ctx)
+            record = each.get_help_record(ctx)
             subject = getattr(each, "rich_help_panel", None) or "Options"
-            if words is not None:
+            if record is not None:
                 named = "Arguments" if each.param_type_name == "argument" else subject
-                subjects.setdefault(named, []).append(words)
+                subjects.setdefault(named, []).append(record)
         if len(subjects["Options"]) == 1:
             subjects["Help"] = subjects.pop("Options")
         widest = min(_NAMES, max(len(name) for rows in subjects.values() for name, _ in rows))
         for subject, rows in subjects.items():
             if rows:
                 with formatter.section(subject):
-                    formatter.write_dl([(name.ljust(widest), words) for name, words in rows], _NAMES)
+                    formatter.write_dl([(name.ljust(widest), text) for name, text in rows], _NAMES)
 
 
 RigFile = Annotated[
@@ -82,7 +82,7 @@ Keys = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class ServiceOptions:
-    """Where a running service is, and its key."""
+    """Address and key of a running service."""
 
     subject: ClassVar = "Service"
 
@@ -150,7 +150,7 @@ class BoardArguments:
 
 @dataclass(frozen=True, slots=True)
 class RobotOptions:
-    """What the command line says of a robot's poses and noise."""
+    """Options of a robot's poses and noise."""
 
     subject: ClassVar = "Robot"
 
@@ -168,7 +168,7 @@ class RobotOptions:
 
 @dataclass(frozen=True, slots=True)
 class MeshOptions:
-    """How a mesh is made, as far as the command line says it."""
+    """Options of a mesh."""
 
     subject: ClassVar = "Mesh"
 
@@ -197,7 +197,7 @@ class MeshOptions:
     ] = None
     region: Annotated[
         Path | None,
-        typer.Option(help="TOML file of what is measured: box_mm, depth_mm and more. Default: all."),
+        typer.Option(help="TOML file of the measured region: box_mm, depth_mm and more. Default: all."),
     ] = None
     drop_finest_bits: Annotated[
         int | None,
@@ -214,15 +214,15 @@ class MeshOptions:
         typer.Option(help="File with the flange's pose at this scan, of a rig in hand: see slrig calibrate hand-eye."),
     ] = None
 
-    def asked(self) -> dict[str, Any]:
-        """What was given, as a request says it. Raises ConfigError: the file of the region is wrong."""
+    def request(self) -> dict[str, Any]:
+        """The given options, as in a request. Raises ConfigError: the file of the region is wrong."""
         from slrig.bundle import read_region
 
         region = None if self.region is None else read_region(self.region).model_dump(mode="json", exclude_unset=True)
         return given(**{**asdict(self), "region": region, "robot_pose": None})
 
     def chosen(self) -> dict[str, Any]:
-        """What was given, as a plan has it. Raises ConfigError: the file of the region is wrong."""
+        """The given options, as in a plan. Raises ConfigError: the file of the region is wrong."""
         from slrig.bundle import read_region
 
         region = None if self.region is None else read_region(self.region).region()
@@ -243,7 +243,7 @@ class MeshOptions:
 
 @dataclass(frozen=True, slots=True)
 class GuessOptions:
-    """What the command line says of devices that are not calibrated; None where it says nothing."""
+    """Options of devices that are not calibrated; None where they are not given."""
 
     subject: ClassVar = "Without a calibration"
 
@@ -273,9 +273,9 @@ class GuessOptions:
         float | None, typer.Option(help="Refuse a shape that is known less well, over its size. Default 0.0015.")
     ] = None
 
-    def asked(self) -> dict[str, Any] | None:
-        """What was given, as a request says it; None for a calibrated rig. Raises ConfigError: a guess without
-        --uncalibrated, or --focal-px that is no CAMERA=PX.
+    def request(self) -> dict[str, Any] | None:
+        """The given options, as in a request; None for a calibrated rig. Raises ConfigError: a guess without
+        --uncalibrated, or --focal-px that is not CAMERA=PX.
         """
         guesses = {key: value for key, value in asdict(self).items() if key != "uncalibrated" and value is not None}
         if not self.uncalibrated:
@@ -297,7 +297,7 @@ class GuessOptions:
 
 @dataclass(frozen=True, slots=True)
 class AcceptanceOptions:
-    """What the command line says of artefacts and limits; None where it says nothing. Lengths in mm."""
+    """Options of artefacts and limits; None where they are not given. Lengths in mm."""
 
     subject: ClassVar = "Artefacts"
 
@@ -375,7 +375,7 @@ class AcceptanceOptions:
     fixture_mm: Annotated[
         float,
         typer.Option(
-            min=0.0, help="By how much an artefact may move or bend where it stands while it is captured (k = 2)."
+            min=0.0, help="By how much an artefact may move or bend in its place while it is captured (k = 2)."
         ),
     ] = 0.0
     notes: Annotated[str, typer.Option(help="Free text for the report.")] = ""
@@ -393,22 +393,22 @@ def grouped(command: Callable[..., None], *, subjects: Mapping[str, str] | None 
     hints = get_type_hints(command, include_extras=True)
     for name, parameter in inspect.signature(command).parameters.items():
         if not is_dataclass(hints[name]):
-            told = _under(named.get(name), hints[name])
-            parameters.append(parameter.replace(annotation=told, kind=inspect.Parameter.KEYWORD_ONLY))
+            annotation = _under(named.get(name), hints[name])
+            parameters.append(parameter.replace(annotation=annotation, kind=inspect.Parameter.KEYWORD_ONLY))
             continue
         groups[name] = hints[name]
         options = get_type_hints(hints[name], include_extras=True)
         for each in fields(hints[name]):
-            told = _under(named.get(each.name, hints[name].subject), options[each.name])
+            annotation = _under(named.get(each.name, hints[name].subject), options[each.name])
             kind = inspect.Parameter.KEYWORD_ONLY
-            parameters.append(inspect.Parameter(each.name, kind, default=each.default, annotation=told))
+            parameters.append(inspect.Parameter(each.name, kind, default=each.default, annotation=annotation))
 
     @functools.wraps(command)
-    def flat(**told: Any) -> None:
+    def flat(**options: Any) -> None:
         made = {
-            name: kind(**{each.name: told.pop(each.name) for each in fields(kind)}) for name, kind in groups.items()
+            name: kind(**{each.name: options.pop(each.name) for each in fields(kind)}) for name, kind in groups.items()
         }
-        command(**told, **made)
+        command(**options, **made)
 
     flat.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     return flat
@@ -418,9 +418,9 @@ def _under(subject: str | None, option: Any) -> Any:
     """The type of an option, with the subject under which help lists it."""
     if subject is None:
         return option
-    words = copy(option.__metadata__[0])
-    words.rich_help_panel = subject
-    return Annotated[option.__origin__, words]
+    described = copy(option.__metadata__[0])
+    described.rich_help_panel = subject
+    return Annotated[option.__origin__, described]
 
 
 def given(**options: object) -> dict[str, object]:
@@ -440,7 +440,7 @@ def period_option(sequence: str | None, period_px: int | None) -> dict[str, int 
 def by_beginning(
     known: Sequence[Mapping[str, Any]], beginning: str, noun: str, refusal: type[SlrigError], *, none: str = "none"
 ) -> Mapping[str, Any]:
-    """The one of what a service keeps whose id begins so. Raises `refusal`, with `none` where it keeps nothing."""
+    """The one of a service's records with this beginning of its id. Raises `refusal`, with `none` if there are none."""
     found = [each for each in known if each["id"].startswith(beginning)]
     if len(found) == 1:
         return found[0]
@@ -452,13 +452,13 @@ def by_beginning(
 
 @dataclass(frozen=True, slots=True)
 class ScanOptions:
-    """What the command line says of the object, of its light and of colour; None where it says nothing."""
+    """Options of the object, of its light and of colour; None where they are not given."""
 
     subject: ClassVar = "Light and colour"
 
     preset: Annotated[str | None, typer.Option(help="Options by name: see slrig preset list.")] = None
     assist: Annotated[
-        bool, typer.Option("--assist", help="Look at the object first, and expose as it needs; within --budget-s.")
+        bool, typer.Option("--assist", help="Measure the object first, and expose as it needs; within --budget-s.")
     ] = False
     budget_s: Annotated[float | None, typer.Option(help="With --assist: the most that capture may take, seconds.")] = (
         None
@@ -477,11 +477,11 @@ class ScanOptions:
         typer.Option(help="Angle of the turntable that the object is shot at; the rig's turntable turns there first."),
     ] = None
     manual: Annotated[
-        bool, typer.Option("--manual", help="With --turn-deg: the object was turned by hand; nothing moves.")
+        bool, typer.Option("--manual", help="With --turn-deg: the object was turned manually; nothing moves.")
     ] = False
 
-    def asked(self) -> dict[str, Any]:
-        """What was given of it, as a request says it."""
+    def request(self) -> dict[str, Any]:
+        """The given options, as in a request."""
         return given(
             preset=self.preset,
             colour=self.colour,

@@ -29,23 +29,23 @@ from slrig.scan.formats import BUNDLE_ZIP, CALIBRATION_USED, missing_for, offere
 from slrig.scan.plan import ReconstructionPlan, RigGuess
 
 Row = tuple[str, ...]
-"""What the table says of a bundle, or of one of its cameras, beside name and seconds; the last cell is a remark."""
+"""Cells of a bundle, or of one of its cameras, after name and seconds; the last is a remark."""
 BUNDLE = "bundle"
 """The folder of a scan's frames in that of the scan: it is the scan that has a name."""
 _MOST_NAMED = 5
 """Names in one message."""
 
 
-def named_bundles(asked: Sequence[Path]) -> tuple[list[Path], bool]:
+def named_bundles(paths: Sequence[Path]) -> tuple[list[Path], bool]:
     """The bundles that arguments name, each once, and whether each has a folder of its own for its results.
 
-    An argument is a bundle, a folder whose direct subfolders are bundles or scans with theirs, or a pattern that no
-    shell has expanded, as on Windows. Subfolders that are no bundles are told on stderr. Raises StorageError: a folder
+    An argument is a bundle, a folder with bundles or scans as direct subfolders, or a pattern that the shell has
+    not expanded, as on Windows. Other subfolders are named on stderr. Raises StorageError: a folder
     cannot be read.
     """
     found: dict[Path, Path] = {}
     several = False
-    for one in asked:
+    for one in paths:
         with storage_errors(one):
             for path in matching(one):
                 inside = _bundles_inside(path)
@@ -63,9 +63,9 @@ def work_through(
     heads: Sequence[Column],
     places: Sequence[str],
 ) -> None:
-    """Work on each bundle, with progress, and print a table, whatever ends this.
+    """Work on each bundle, with progress, and print a table at every end.
 
-    Every description is read before the first bundle is worked on. One that fails is told at once; the others go on.
+    Every description is read before the first bundle is worked on. A failure is printed at once; the others go on.
 
     work : given a bundle, the folder for its results and the progress; returns rows. prepare : done once, if there is a
     bundle to work on. heads : of the cells of a `Row` but the last. places : lines that say where results lie.
@@ -83,7 +83,7 @@ def work_through(
     try:
         with progress_shown() as display:
             for bundle in bundles:
-                with _failure_told(bundle, failed, display):
+                with _failure_printed(bundle, failed, display):
                     read_description(bundle)
             if len(failed) < len(bundles):
                 prepare(display)
@@ -91,7 +91,7 @@ def work_through(
                 if bundle in failed:
                     continue
                 name, began_s = _name(bundle), time.monotonic()
-                with _failure_told(bundle, failed, display):
+                with _failure_printed(bundle, failed, display):
                     rows = work(bundle, output / name, _part_of(display, place, len(bundles), name))
                     labels = [(name, f"{time.monotonic() - began_s:.1f}"), *[("", "")] * (len(rows) - 1)]
                     done[bundle] = [
@@ -104,10 +104,10 @@ def work_through(
         raise typer.Exit(1 if UNEXPECTED in failed.values() else 2)
 
 
-def matching(asked: Path) -> list[Path]:
-    """What a pattern names, in natural order. A path stands for itself, and so does what matches nothing."""
-    matching = [] if asked.exists() else glob(str(asked))  # noqa: PTH207 - Path.glob takes no absolute pattern
-    return sorted(map(Path, matching), key=natural_sort_key) or [asked]
+def matching(paths: Path) -> list[Path]:
+    """Paths that match a pattern, in natural order. A path, or a pattern without a match, gives itself."""
+    matching = [] if paths.exists() else glob(str(paths))  # noqa: PTH207 - Path.glob takes no absolute pattern
+    return sorted(map(Path, matching), key=natural_sort_key) or [paths]
 
 
 def _bundles_inside(folder: Path) -> list[Path]:
@@ -117,7 +117,7 @@ def _bundles_inside(folder: Path) -> list[Path]:
     if not folder.is_dir() or (folder / DESCRIPTION).is_file():
         return []
     inside = sorted((each for each in folder.iterdir() if each.is_dir() and each.name[0] != "."), key=natural_sort_key)
-    # A scan of the service has its bundle beside its results.
+    # A scan of the service has its bundle next to its results.
     held = {each: [place for place in (each, each / BUNDLE) if (place / DESCRIPTION).is_file()][:1] for each in inside}
     found = [place for places in held.values() for place in places]
     skipped = [each.name for each, places in held.items() if not places]
@@ -161,25 +161,25 @@ def _require_room(bundles: Sequence[Path], output: Path) -> None:
 
 
 @contextmanager
-def _failure_told(bundle: Path, failed: dict[Path, str], display: ProgressDisplay) -> Iterator[None]:
-    """Tell the error that ends a bundle's work, and keep its code. An interruption goes on."""
+def _failure_printed(bundle: Path, failed: dict[Path, str], display: ProgressDisplay) -> Iterator[None]:
+    """Print the error that ends a bundle's work, and keep its code. An interruption is raised."""
     try:
         yield
-    except Exception as error:  # noqa: BLE001 - whatever it is, the other bundles are worked on
+    except Exception as error:  # noqa: BLE001 - after any error the other bundles are worked on
         failure = job_failure(error)
-        words = failure.message if failure.code != UNEXPECTED else f"a defect of slrig\n{traceback.format_exc()}"
-        display.error(words if str(bundle) in words else f"{bundle}: {words}")
+        text = failure.message if failure.code != UNEXPECTED else f"a defect of slrig\n{traceback.format_exc()}"
+        display.error(text if str(bundle) in text else f"{bundle}: {text}")
         failed[bundle] = failure.code
 
 
 def _part_of(display: ProgressDisplay, place: int, count: int, name: str) -> Listener:
     """Progress of one bundle as that of all. place : 1 for the first."""
 
-    def told(stage: str, fraction: float, detail: str, /) -> None:
+    def report(stage: str, fraction: float, detail: str, /) -> None:
         where = f"{place} of {count}: {name}"
         display(stage, (place - 1 + fraction) / count, f"{where}, {detail}" if detail else where)
 
-    return Listener(report=told)
+    return Listener(report=report)
 
 
 def _print_summary(
@@ -200,14 +200,14 @@ def _print_summary(
         typer.echo(line)
 
 
-def decode_and_tell(asked: Sequence[Path], output: Path) -> None:
-    """Decode bundles without a calibration, and print what was found and what to change. Raises as decoding does, and
+def decode_and_print(paths: Sequence[Path], output: Path) -> None:
+    """Decode bundles without a calibration, and print the findings and what to change. Raises as decoding does, and
     of several as `work_through` does.
     """
     from slrig.scan.reconstruct import decode_bundle
 
     set_up_console_logs()
-    bundles, several = named_bundles(asked)
+    bundles, several = named_bundles(paths)
     if several:
 
         def decoded(bundle: Path, folder: Path, listener: Listener) -> list[Row]:
@@ -237,8 +237,8 @@ def decode_and_tell(asked: Sequence[Path], output: Path) -> None:
     typer.echo(f"{'pictures':<10}{output}")
 
 
-def reconstruct_and_tell(
-    asked: Sequence[Path],
+def reconstruct_and_print(
+    paths: Sequence[Path],
     output: Path,
     *,
     calibration: Path | None,
@@ -250,14 +250,14 @@ def reconstruct_and_tell(
     bundles what `work_through` does.
 
     further : names of files that are written as well; options : fields of `ReconstructionPlan` that were given; guess :
-    fields of `RigGuess`, for bundles without a calibration. Raises ConfigError: there is a calibration beside it.
+    fields of `RigGuess`, for bundles without a calibration. Raises ConfigError: there is a calibration, too.
     """
     set_up_console_logs()
     if guess is not None and calibration is not None:
         message = "--uncalibrated finds a calibration, and --calibration gives one; leave one of the two out"
         raise ConfigError(message)
     plan = ReconstructionPlan(**options, uncalibrated=None if guess is None else RigGuess(**guess))
-    bundles, several = named_bundles(asked)
+    bundles, several = named_bundles(paths)
     # What is wrong with the files is said at once, not after a minute in which kernels are compiled.
     further = tuple(dict.fromkeys(further))
     if not several:
@@ -276,8 +276,8 @@ def reconstruct_and_tell(
         return report_summary(report)
 
     always = (MESH, "preview.png", REPORT)
-    told = [(Path(name).suffix[1:], name) for name in further if name not in always]
-    files = (("mesh", MESH), *told, ("preview", "preview.png"), ("report", "report.json"))
+    named = [(Path(name).suffix[1:], name) for name in further if name not in always]
+    files = (("mesh", MESH), *named, ("preview", "preview.png"), ("report", "report.json"))
     if several:
         work_through(
             bundles, output, lambda *each: [_row(reconstructed(*each))], prepare=prepare_kernels,
@@ -313,7 +313,7 @@ def _require_offered(names: Sequence[str], bundle: Path) -> list[str]:
 
 
 def _write_further(folder: Path, name: str, cameras: Sequence[str], bundle: Path, calibration: Path | None) -> None:
-    """Write a file of a reconstruction that is made only when it is asked for. Raises as its maker does."""
+    """Write a file of a reconstruction that is made only on request. Raises as its maker does."""
     found = on_demand(name, cameras)
     if found is not None:
         from slrig.scan.clouds import cloud_file
@@ -328,7 +328,7 @@ def _figures(name: str) -> Column:
 
 
 def _row(summary: Mapping[str, Any]) -> Row:
-    """What a table says of a reconstruction: triangles, median of the stated deviations, share covered, a remark."""
+    """Row of a reconstruction: triangles, median of the stated deviations, share covered, a remark."""
     mesh = summary["mesh"]
     sigma_mm, covered, notes = mesh["sigma_mm"]["p50"], mesh["covers_of_decoded"], summary["notes"]
     return (
@@ -340,14 +340,14 @@ def _row(summary: Mapping[str, Any]) -> Row:
 
 
 def warm() -> None:
-    """Compile or load the kernels of a usual scan, and tell how many there are and where they are kept."""
+    """Compile or load the kernels of a usual scan, and print how many there are and where they are kept."""
     began_s = time.monotonic()
     with progress_shown() as display:
         count = prepare_kernels(display)
     # numba: a second.
     from slrig.kernels import why_compiled
 
-    place = os.environ.get("NUMBA_CACHE_DIR") or "beside slrig's own files"
+    place = os.environ.get("NUMBA_CACHE_DIR") or "next to slrig's own files"
     why = why_compiled()
     kept = "as they came with slrig" if why is None else f"kept {place}; compiled here, because {why}"
     typer.echo(f"{count} kernels are ready, {kept} ({time.monotonic() - began_s:.0f} s)")
@@ -361,15 +361,15 @@ def prepare_kernels(display: ProgressDisplay) -> int:
         from slrig.kernels import KernelCount, are_all_cached, count_prepared
         from slrig.scan.reconstruct import warm_kernels
 
-    def told(now: KernelCount) -> None:
+    def report(now: KernelCount) -> None:
         display(PREPARING, 0.0, f"first time only: {now.done} of {now.total}")
 
     if not are_all_cached():
-        warm_kernels(told)
+        warm_kernels(report)
     return count_prepared().total
 
 
 def keep_kernels() -> None:
-    """Have the kernels of this process kept in the cache of the person who runs it."""
+    """Keep the kernels of this process in the cache of its user."""
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     prepare_kernel_cache(Path(base) / "slrig")

@@ -41,7 +41,7 @@ _MEANINGS = {
     "rig.json": "the rig as the service has it",
     **{f"{kind}.json": f"what slrig {kind} found" for kind in (JobKind.DOCTOR, JobKind.LATENCY)},
     "conformance.json": "what slrig conform found",
-    "scan-1": "one scan: report.json; pictures if they were asked for",
+    "scan-1": "one scan: report.json; pictures if requested",
     "scan-2": "a second one, of what should not have moved",
     "service.log": "what the service of this command wrote",
 }
@@ -75,7 +75,7 @@ class _Parts:
         part.report("gathering", 0.0, "")
         try:
             files = gather(part)
-        except Exception as error:  # noqa: BLE001 - whatever it is, the other parts can be sent
+        except Exception as error:  # noqa: BLE001 - after any error the other parts can be sent
             self.missing[name] = str(error) if isinstance(error, SlrigError) else f"{type(error).__name__}: {error}"
             return
         for path, content in files.items():
@@ -93,7 +93,7 @@ class _Parts:
 
 
 def write_report(rig_file: Path | None, service: ServiceOptions, output: Path, *, pictures: bool, force: bool) -> None:
-    """Gather all that can be had of this machine and of a rig, and tell what could not.
+    """Gather all that can be had of this machine and of a rig, and print what could not.
 
     rig_file : of the rig, which a service of this command opens; None for the rig of the running service.
     Raises ConfigError: the file exists, there is no such rig file, or the file of the key cannot be read; StorageError.
@@ -125,7 +125,7 @@ def write_report(rig_file: Path | None, service: ServiceOptions, output: Path, *
     for name, cause in parts.missing.items():
         typer.echo(f"{'missing':<10}{name}: {cause}", err=True)
     typer.echo(f"{'report':<10}{output}")
-    typer.echo(f"{'to send':<10}look into it first; its README.txt says what is what")
+    typer.echo(f"{'to send':<10}check it first; its README.txt says what is what")
 
 
 def _add_rig(parts: _Parts, client: Client, scratch: Path, *, pictures: bool) -> None:
@@ -187,7 +187,7 @@ def _kernel_log() -> str:
 
 
 def _said(command: str) -> tuple[int, str]:
-    """Exit code of a tool, and what it said or why it did not."""
+    """Exit code of a tool, and its output or the cause of its failure."""
     try:
         done = subprocess.run(  # noqa: S603 - tools of the system, named above
             command.split(), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False,

@@ -55,7 +55,7 @@ _INDENT = " " * 4
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """A key of a table in a rig file. limits : range or choices, in words; "" where there are none."""
+    """A key of a table in a rig file. limits : range or choices, as text; "" where there are none."""
 
     name: str
     kind: str
@@ -73,13 +73,13 @@ class Section:
     options: tuple[Option, ...]
 
 
-def tell_options(driver: str, *, as_json: bool) -> None:
+def print_options(driver: str, *, as_json: bool) -> None:
     """Print the options of a driver, for people or as JSON Schema.
 
     Raises
     ------
     DriverNotFoundError, DriverBrokenError
-        There is no such driver, or what describes its options cannot be loaded.
+        There is no such driver, or the description of its options cannot be loaded.
     """
     kinds, model = driver_kinds(driver), option_model(driver)
     if as_json:
@@ -101,17 +101,17 @@ def sections(schema: Schema, table: str) -> tuple[Section, ...]:
 
 
 def option(name: str, part: Schema, schema: Schema, *, required: bool) -> Option:
-    """What one property of a model's JSON Schema says. `schema` is the whole."""
+    """An option by one property of a model's JSON Schema. `schema` is the whole."""
     default = "required" if required else _value(part.get("default"))
     unit = part.get("unit") or next((unit for end, unit in _UNITS.items() if name.endswith(f"_{end}")), "–")
     meaning = " ".join(str(part.get("description", "")).split())
     return Option(name, _kind(part, schema), unit, default, _limits(part, schema), meaning)
 
 
-def explained(told: Option) -> str:
-    """What an option means, and what it may be."""
-    limits = f"{told.limits[:1].upper()}{told.limits[1:]}." if told.limits else ""
-    return f"{told.meaning} {limits}".strip()
+def explained(option: Option) -> str:
+    """Meaning and limits of an option."""
+    limits = f"{option.limits[:1].upper()}{option.limits[1:]}." if option.limits else ""
+    return f"{option.meaning} {limits}".strip()
 
 
 def _sections(part: Schema, schema: Schema, path: str, heading: str) -> Iterator[Section]:
@@ -194,10 +194,10 @@ def _value(value: object) -> str:
             return str(value).removesuffix(".0")
 
 
-def _option_lines(told: Sequence[Section], width: int) -> Iterator[str]:
-    """A row per option, and what it means below it: four columns and a sentence do not fit side by side."""
+def _option_lines(sections: Sequence[Section], width: int) -> Iterator[str]:
+    """A row per option, and its meaning below it: four columns and a sentence do not fit side by side."""
     rows = [("option", "type", "unit", "default")]
-    rows += [(each.name, each.kind, each.unit, each.default) for part in told for each in part.options]
+    rows += [(each.name, each.kind, each.unit, each.default) for part in sections for each in part.options]
     wide = [max(len(row[column]) for row in rows) for column in range(3)]
 
     def row(name: str, kind: str, unit: str, default: str) -> str:
@@ -205,7 +205,7 @@ def _option_lines(told: Sequence[Section], width: int) -> Iterator[str]:
         return f"{shown}  {kind.ljust(wide[1])}  {unit.ljust(wide[2])}  {default}"
 
     yield row(*rows[0])
-    for part in told:
+    for part in sections:
         yield f"\n{part.heading}"
         for each in part.options:
             yield row(each.name, each.kind, each.unit, each.default)
@@ -217,7 +217,7 @@ Answer = TypeVar("Answer")
 _NAMES = {1: ("camera",), 2: ("left", "right")}
 _KINDS = {bool: "boolean", int: "integer", float: "number", str: "string", list: "array", dict: "object"}
 _WIDTH, _WIDEST = 80, 100
-"""Columns of the file, and the most of what is said."""
+"""Columns of the file, and the most of messages."""
 _USUAL_EXPOSURE_S = 0.0167
 """A period of 60 Hz."""
 
@@ -234,7 +234,7 @@ class RigFileTable:
 
     @property
     def title(self) -> str:
-        """The device in words."""
+        """The device's name for people."""
         return f"{'camera ' + repr(self.name) if self.kind == 'camera' else 'the projector'} (driver {self.driver})"
 
 
@@ -253,9 +253,9 @@ def init(
 
     cameras : [NAME=]DRIVER[:DEVICE]; projector : DRIVER[:DEVICE]; settings : TABLE.KEY=VALUE.
 
-    Raises ConfigError where a file would be overwritten, an answer is wrong, or something is not known and there is
-    nobody to ask; DeviceGoneError where no camera or no projector is plugged in, and none is named; another SlrigError
-    where a named driver is not installed or broken, or the disk refused.
+    Raises ConfigError where a file would be overwritten, an answer is wrong, or something is not known and
+    cannot be asked; DeviceGoneError where no camera or no projector is plugged in, and none is named; another
+    SlrigError where a named driver is not installed or broken, or the disk refused.
     """
     refuse_existing(output, force=force)
     ask = not yes and terminal()
@@ -280,7 +280,7 @@ def init(
     for part in (lit, *shot):
         _complete(part, ask=ask)
     write_file(output, rig_text(output, name, lit, shot, exposure_s).encode())
-    _tell(lit, shot, output)
+    _print_next_steps(lit, shot, output)
 
 
 def write_example(name: str, output: Path, *, force: bool) -> None:
@@ -292,7 +292,7 @@ def write_example(name: str, output: Path, *, force: bool) -> None:
 
 
 def terminal() -> bool:
-    """Whether somebody can be asked."""
+    """Whether there is a person to ask."""
     return sys.stdin.isatty() and sys.stdout.isatty()
 
 
@@ -305,7 +305,7 @@ def _named_cameras(texts: Sequence[str], found: DiscoveredDevices) -> list[RigFi
 
 
 def _named(kind: str, text: str, found: DiscoveredDevices, name: str) -> RigFileTable:
-    """What DRIVER:DEVICE means; a driver alone means its only device. Raises ConfigError, DriverNotFoundError."""
+    """The device of DRIVER:DEVICE; a driver alone means its only device. Raises ConfigError, DriverNotFoundError."""
     driver, _, device = text.partition(":")
     kinds = driver_kinds(driver)
     if kind not in kinds:
@@ -377,16 +377,16 @@ def _assign(text: str, parts: Mapping[str, RigFileTable]) -> None:
 
 
 def _complete(part: RigFileTable, *, ask: bool) -> None:
-    """Ask for what the driver needs and the rig file does not say. Raises ConfigError where there is nobody to ask."""
+    """Ask for options that the driver needs and the rig file lacks. Raises ConfigError where that is not possible."""
     model = option_model(part.driver)
     schema = {} if model is None else model.model_json_schema()
     for name in [each for each in schema.get("required", ()) if each not in part.options]:
         needed = schema["properties"][name]
-        told = f"{part.title} needs {name}: {explained(option(name, needed, schema, required=True))}"
+        text = f"{part.title} needs {name}: {explained(option(name, needed, schema, required=True))}"
         if not ask:
-            message = f"{told}\n  say it with --set {part.name}.{name}=VALUE"
+            message = f"{text}\n  say it with --set {part.name}.{name}=VALUE"
             raise ConfigError(message)
-        _say(f"\n{told}")
+        _say(f"\n{text}")
 
         def answer(text: str, key: str = name, kinds: Collection[str] = json_types(needed)) -> object:
             value = typed(text, kinds)
@@ -438,7 +438,7 @@ def _listed(devices: Sequence[FoundDevice]) -> str:
 def _nothing_there(
     lacking: Sequence[str], offered: Mapping[str, Sequence[FoundDevice]], found: DiscoveredDevices
 ) -> str:
-    """Words for a camera or a projector that is neither named nor plugged in, with what to check."""
+    """Message about a camera or a projector that is neither named nor plugged in, with what to check."""
     there = [f"{each.driver}:{each.device}" for kind in ("camera", "projector") for each in offered[kind]]
     flags = " ".join(f"--{kind} DRIVER:DEVICE" for kind in lacking)
     screen = (
@@ -447,7 +447,7 @@ def _nothing_there(
     lines = [
         f"no {' and no '.join(lacking)} is plugged in that an installed driver can find",
         *([f"found: {', '.join(there)}"] if there else []),
-        "check cable and power, and your right to open the device: slrig devices tells what it sees",
+        "check cable and power, and your right to open the device: slrig devices lists what it finds",
         *([screen] if "projector" in lacking else []),
         *(f"more can be found after, for {each.driver}: {each.install}" for each in found.missing),
         *(f"not looked for: {fault}" for fault in found.faults),
@@ -461,12 +461,12 @@ def _nothing_there(
     return "\n  ".join(lines)
 
 
-def _tell(projector: RigFileTable, cameras: Sequence[RigFileTable], output: Path) -> None:
+def _print_next_steps(projector: RigFileTable, cameras: Sequence[RigFileTable], output: Path) -> None:
     named = ", ".join(f"{each.name} ({each.driver})" for each in cameras)
     _say(f"\nWrote {output}: projector ({projector.driver}), {named}. No device was opened. Next:")
     better = output.with_stem(f"{output.stem}-measured")
     steps = (
-        (f"slrig doctor {output} --output {better}", "light, focus, timing; a file with what it measured"),
+        (f"slrig doctor {output} --output {better}", "light, focus, timing; a file with the measured values"),
         (f"slrig serve {better}", "the service; it prints a key for the next steps"),
         ("slrig calibrate board --output board.pdf", "a board to print"),
         ("slrig calibrate run", "walks you through its poses"),
@@ -490,7 +490,7 @@ def json_types(part: Mapping[str, Any]) -> frozenset[str]:
 
 
 def typed(text: str, kinds: Collection[str]) -> object:
-    """What a person wrote as a value: TOML where the option takes such a value, else text.
+    """A typed value: TOML where the option takes such a value, else text.
 
     >>> typed("0", frozenset({"integer", "string"})), typed("0", frozenset({"string"})), typed("CAM_B", frozenset())
     (0, '0', 'CAM_B')
@@ -505,7 +505,7 @@ def typed(text: str, kinds: Collection[str]) -> object:
 
 
 def failure_of(driver: str, options: Mapping[str, object], key: str = "") -> str:
-    """What the driver's model says against options, of one of them or of all; "" where it takes them."""
+    """Faults of options by the driver's model, of one of them or of all; "" where it takes them."""
     model = option_model(driver)
     if model is None:
         return ""
@@ -539,7 +539,7 @@ def rig_text(path: Path, name: str, projector: RigFileTable, cameras: Sequence[R
 def _lines(name: str, projector: RigFileTable, cameras: Sequence[RigFileTable], exposure_s: float) -> Iterator[str]:
     yield "# Written by slrig init. For every option: slrig devices --options DRIVER"
     yield f"name = {toml_value(name)}"
-    yield '# calibration = "calibration.json"  # beside this file, once there is one'
+    yield '# calibration = "calibration.json"  # next to this file, once there is one'
     yield "\n[projector]"
     yield from _keys(projector)
     for number, camera in enumerate(cameras):
@@ -585,11 +585,11 @@ class BrokenPackage:
 
 
 def list_devices(*, as_json: bool) -> None:
-    """Print the drivers that are installed, the devices that are plugged in, and what is missing to drive more."""
+    """Print the installed drivers, the devices that are plugged in, and what is missing for more."""
     with _only_ours_on_stdout():
         drivers = installed_drivers()
         finders = sorted({driver.name for driver in drivers if driver.kind == "finder" and driver.fault is None})
-        # Some ask a network, and wait for answers.
+        # Some query a network, and wait for answers.
         typer.echo(f"Looking for devices of {', '.join(finders)} …", err=True)
         found = discover_devices()
     if as_json:
@@ -597,13 +597,13 @@ def list_devices(*, as_json: bool) -> None:
         return
     broken = broken_packages(drivers)
     console = Console()
-    _tell_drivers(drivers, found, console)
-    _tell_devices(found, console)
-    _tell_remedies(found, broken, {driver.fault for driver in drivers})
+    _print_drivers(drivers, found, console)
+    _print_devices(found, console)
+    _print_remedies(found, broken, {driver.fault for driver in drivers})
 
 
 def devices_document(drivers: Sequence[InstalledDriver], found: DiscoveredDevices) -> dict[str, Any]:
-    """What `slrig devices --json` prints."""
+    """The document of `slrig devices --json`."""
     return {
         "drivers": [asdict(driver) for driver in drivers],
         "devices": [{key: each for key, each in asdict(device).items() if each != {}} for device in found.devices],
@@ -615,7 +615,7 @@ def devices_document(drivers: Sequence[InstalledDriver], found: DiscoveredDevice
 
 
 def broken_packages(drivers: Sequence[InstalledDriver]) -> tuple[BrokenPackage, ...]:
-    """The packages whose drivers cannot be loaded, by name, each with the first of its faults."""
+    """The packages with drivers that cannot be loaded, by name, each with the first of its faults."""
     faulty = [driver for driver in drivers if driver.fault is not None]
     return tuple(
         BrokenPackage(
@@ -628,7 +628,7 @@ def broken_packages(drivers: Sequence[InstalledDriver]) -> tuple[BrokenPackage, 
     )
 
 
-def _tell_drivers(drivers: Sequence[InstalledDriver], found: DiscoveredDevices, console: Console) -> None:
+def _print_drivers(drivers: Sequence[InstalledDriver], found: DiscoveredDevices, console: Console) -> None:
     missing = {library.driver for library in found.missing}
     elsewhere = {driver.driver for driver in found.elsewhere}
     table = _table("Installed drivers", "driver", "for a", "package", "state")
@@ -650,7 +650,7 @@ def _tell_drivers(drivers: Sequence[InstalledDriver], found: DiscoveredDevices, 
     console.print()
 
 
-def _tell_devices(found: DiscoveredDevices, console: Console) -> None:
+def _print_devices(found: DiscoveredDevices, console: Console) -> None:
     if not found.devices:
         console.print(
             "No device is plugged in that an installed driver can find. Check cable and power; if the system does see "
@@ -664,7 +664,7 @@ def _tell_devices(found: DiscoveredDevices, console: Console) -> None:
     console.print("\nslrig init writes a rig file for them. Every option: slrig devices --options DRIVER")
 
 
-def _tell_remedies(found: DiscoveredDevices, broken: Sequence[BrokenPackage], told: set[str | None]) -> None:
+def _print_remedies(found: DiscoveredDevices, broken: Sequence[BrokenPackage], printed: set[str | None]) -> None:
     # Neither wrapped nor styled: commands are there to be copied whole.
     if found.missing:
         typer.echo("\nMore devices can be used after:")
@@ -678,9 +678,9 @@ def _tell_remedies(found: DiscoveredDevices, broken: Sequence[BrokenPackage], to
         names = ", ".join(package.drivers)
         typer.echo(f"\nBroken: package {package.package} (drivers: {names}); the others work without it.")
         typer.echo(f"  {package.fault}\n  to remove it: {package.remove}")
-    # A finder that cannot be loaded was told with its package.
+    # A finder that cannot be loaded was printed with its package.
     for fault in map(str, found.faults):
-        if fault not in told:
+        if fault not in printed:
             typer.echo(f"\nNot looked for: {fault}")
 
 

@@ -24,9 +24,9 @@ _TABLES = {"camera": "CameraTable", "projector": "DriverTable", "head": "HeadTab
 def rig_schema() -> str:
     """The JSON schema, as text.
 
-    A table of a driver that is known here is checked by `if` and `then`, which editors tell well; the same driver's
-    schema is among `anyOf` as well, where editors look for keys to propose (Taplo does not look into `then`). The last
-    of these takes any driver.
+    A table of a driver that is known here is checked by `if` and `then`, which editors report well; the same driver's
+    schema is among `anyOf` as well, where editors find keys to propose (Taplo does not read `then`). The last of these
+    takes any driver.
     """
     models = {name: model for name in drivers_with_options(PACKAGE) if (model := option_model(name)) is not None}
     every: list[type[BaseModel]] = [RigTable, *models.values()]

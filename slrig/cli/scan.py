@@ -31,7 +31,7 @@ from slrig.jobs.listener import Listener
 
 _HEADS = ("scan", Column("triangles", justify="right"), Column("σ mm", justify="right"), "")
 _DIGITS = 3
-"""Of a scan's number in its series, which has at most 500."""
+"""Digits of a scan's number in its series, which has at most 500."""
 
 FILES = ("mesh.ply", "preview.png", "report.json")
 
@@ -53,12 +53,12 @@ def scan_with(
     ServiceError
         The service refused, is gone, or the scan failed.
     ScanCancelledError
-        Somebody else cancelled it.
+        It was cancelled elsewhere.
     """
     _require_offered(client, files)
-    with _followed_by(listener) as told:
+    with _followed_by(listener) as shown:
         job = _started(client, request)
-        return _completed(client, job, job.scan["links"]["cancel"], output, files, told)
+        return _completed(client, job, job.scan["links"]["cancel"], output, files, shown)
 
 
 def series_with(
@@ -69,9 +69,9 @@ def series_with(
     *,
     files: tuple[str, ...] = FILES,
 ) -> None:
-    """Scan a series, fetch the files of each scan into a folder of its number, and print what became of them.
+    """Scan a series, fetch the files of each scan into a folder of its number, and print their outcomes.
 
-    A scan that fails is told at the end; the others go on. Ctrl-C cancels those that are left.
+    A failed scan is reported at the end; the others go on. Ctrl-C cancels the rest.
 
     Raises
     ------
@@ -84,12 +84,12 @@ def series_with(
     rows: list[tuple[str, ...]] = []
     failures: list[str] = []
     try:
-        with _followed_by(listener) as told:
+        with _followed_by(listener) as shown:
             job = _started(client, request)
             series, scans = job.scan["links"]["series"], job.series()
             for number, job in enumerate(scans, 1):
                 name = f"{number:0{_DIGITS}}"
-                one = told.within(0.0, 1.0, f"{name} of {len(scans)}")
+                one = shown.within(0.0, 1.0, f"{name} of {len(scans)}")
                 try:
                     scan = _completed(client, job, f"{series}/cancel", output / name, files, one)
                 except (ServiceError, ScanCancelledError) as error:
@@ -108,19 +108,19 @@ def series_with(
 
 
 def assisted(client: Client, request: Mapping[str, Any], *, budget_s: float | None = None) -> dict[str, Any]:
-    """The request with the exposures that the object needs, which are told. Raises ServiceError: the service refused;
-    ConfigError: the request has exposures of its own.
+    """The request with the exposures that the object needs, which are printed. Raises ServiceError: the service
+    refused; ConfigError: the request has exposures of its own.
     """
     if request.keys() & {"exposure_s", "exposures_s"}:
         message = "--assist: it finds the exposures itself, and --exposure-s gives some. Leave out one of the two."
         raise ConfigError(message)
     if request["if_busy"] == "queue":
-        message = "--assist: it looks at the object at once, and --queue waits in line. Leave out one of the two."
+        message = "--assist: it measures the object at once, and --queue waits in line. Leave out one of the two."
         raise ConfigError(message)
     same = {key: request.get(key) for key in ("preset", "patterns", "coloured_light")}
     found = client.scans.exposure(budget_s=budget_s, **same)
     times = " and ".join(f"{1000 * each['exposure_s']:.3g} ms" for each in found["exposures"])
-    typer.echo(f"{'exposure':<9} {times}: {found['completeness']:.1%} of what is lit, in {found['seconds']:.1f} s")
+    typer.echo(f"{'exposure':<9} {times}: {found['completeness']:.1%} of the lit area, in {found['seconds']:.1f} s")
     for note in found["notes"]:
         typer.echo(f"{'':<9} {note}")
     return {**request, **found["scan"]}
@@ -149,7 +149,7 @@ def _completed(
     files: Sequence[str],
     listener: Listener,
 ) -> dict[str, Any]:
-    """Follow a scan to its end, fetch its files, and return it. cancel : what Ctrl-C asks for."""
+    """Follow a scan to its end, fetch its files, and return it. cancel : path that Ctrl-C posts to."""
     try:
         result = job.result(listener.report)
     except KeyboardInterrupt:
@@ -201,8 +201,8 @@ def _require_offered(client: Client, files: Sequence[str]) -> None:
         raise ConfigError(message)
 
 
-def tell_result(scan: Mapping[str, Any], output: Path, *, files: tuple[str, ...] = FILES) -> None:
-    """Print where the files of a scan lie and how good the mesh is."""
+def print_result(scan: Mapping[str, Any], output: Path, *, files: tuple[str, ...] = FILES) -> None:
+    """Print the paths of a scan's files and the quality of the mesh."""
     names = {"mesh.ply": "mesh", "preview.png": "preview", "report.json": "report"}
     for name in files:
         if (output / name).is_file():
@@ -217,7 +217,7 @@ _POLL_S = 0.05
 _READY_POLL_S = 0.2
 """Each answer takes some milliseconds of the service's time, which opens the rig meanwhile."""
 _OPENING_SHARE, _SERVICE_SHARE = 0.15, 0.5
-"""Of a demonstration's time: until the service has started, and until the rig is rendered and open."""
+"""Shares of a demonstration's time: until the service has started, and until the rig is rendered and open."""
 LABEL = "demo"
 
 
@@ -235,7 +235,7 @@ def run_demo(rig: Path, output: Path, data: Path | None, *, show: bool) -> None:
             client = stack.enter_context(rig_service(rig, data, display))
             scan = scan_with(client, {"label": LABEL}, output, Listener(report=display).within(_SERVICE_SHARE, 1.0))
             removed = remove_earlier(client, scan)
-        tell_result(scan, output)
+        print_result(scan, output)
         size_mb = sum(path.stat().st_size for path in data.rglob("*") if path.is_file()) / 1e6
         typer.echo(f"{'data':<9} {data}, {size_mb:.0f} MB: the frames, and all that the service keeps")
         if removed:
@@ -243,7 +243,7 @@ def run_demo(rig: Path, output: Path, data: Path | None, *, show: bool) -> None:
         if show:
             _show_page(f"{_url(data)}{client.system.make_link()['path']}#/scan/{scan['id']}")
         else:
-            _tell_next(rig, data / "scans" / scan["id"] / "bundle", output)
+            _print_next(rig, data / "scans" / scan["id"] / "bundle", output)
     require_sound(scan)
 
 
@@ -334,7 +334,7 @@ def _await_address(process: subprocess.Popen[bytes], data: Path) -> str:
     """Wait for the service, and return its address."""
     deadline = time.monotonic() + START_LIMIT_S
     while not (data / "service.json").is_file():
-        _require_alive(process, data, deadline)
+        _require_running(process, data, deadline)
         time.sleep(_POLL_S)
     return _url(data)
 
@@ -346,20 +346,20 @@ def _url(data: Path) -> str:
 
 def _await_ready(process: subprocess.Popen[bytes], client: Client, data: Path, display: ProgressDisplay) -> None:
     deadline = time.monotonic() + START_LIMIT_S
-    told = ""
+    shown = ""
     while (missing := still_missing(client)) is not None:
-        if missing != told:
-            # A slow machine is no reason to give up, as long as it gets on.
-            told, deadline = missing, time.monotonic() + START_LIMIT_S
+        if missing != shown:
+            # Not given up on a slow machine, as long as it makes progress.
+            shown, deadline = missing, time.monotonic() + START_LIMIT_S
             display("opening the rig", _OPENING_SHARE, missing)
-        _require_alive(process, data, deadline)
+        _require_running(process, data, deadline)
         time.sleep(_READY_POLL_S)
 
 
 def still_missing(client: Client) -> str | None:
-    """What the service's rig waits for, None once it is open. Raises ServiceError with what is wrong.
+    """Reason why the service's rig is not open yet, None once it is. Raises ServiceError with the fault.
 
-    The reconstruction is not waited for: its kernels are prepared while the frames are taken. How far they are is told.
+    It does not wait for the reconstruction: its kernels are prepared while frames are taken, which their job reports.
     """
     try:
         now = client.system.readiness()
@@ -387,18 +387,18 @@ def remove_earlier(client: Client, scan: Mapping[str, Any]) -> int:
     return len(ours)
 
 
-def _require_alive(process: subprocess.Popen[bytes], data: Path, deadline: float) -> None:
+def _require_running(process: subprocess.Popen[bytes], data: Path, deadline: float) -> None:
     log = data / "service.log"
     if process.poll() is not None:
         tail = "\n".join(log.read_text(encoding="utf-8", errors="replace").splitlines()[-8:])
-        message = f"The service ended before it was ready, with exit code {process.returncode}. Its last words:\n{tail}"
+        message = f"The service ended before it was ready, with exit code {process.returncode}. Its log ends:\n{tail}"
         raise ServiceError(message)
     if time.monotonic() > deadline:
         message = f"The service was not ready within {START_LIMIT_S:.0f} s. Its log is {log}."
         raise ServiceError(message)
 
 
-def _tell_next(rig: Path, bundle: Path, output: Path) -> None:
+def _print_next(rig: Path, bundle: Path, output: Path) -> None:
     live, again = (shlex.quote(str(output.parent / f"{output.name}-{end}")) for end in ("live", "again"))
     # As it was called: in a fresh checkout that is .venv/bin/slrig, and no slrig is on the path.
     program = shlex.quote(sys.argv[0]) if Path(sys.argv[0]).name == "slrig" else "slrig"
@@ -406,7 +406,7 @@ def _tell_next(rig: Path, bundle: Path, output: Path) -> None:
         rig_text, own = rig.stem, Path("my-rig.toml")
         copy = f"{program} init --example {rig.stem} --output {own}"
     else:
-        # Paths in a rig file are relative to it, so that a copy belongs beside it.
+        # Paths in a rig file are relative to it, so that a copy belongs next to it.
         rig_text, own = shlex.quote(str(rig)), rig.with_name("my-rig.toml")
         copy = f"cp {rig_text} {shlex.quote(str(own))}"
     own_text, bundle_text = (shlex.quote(str(path)) for path in (own, bundle))

@@ -33,7 +33,7 @@ def list_scans(
     since: Annotated[datetime | None, typer.Option(help="Created then or later, by the clock here.")] = None,
     until: Annotated[datetime | None, typer.Option(help="Created before, by the clock here.")] = None,
     rig: Annotated[str | None, typer.Option(help="Name of the rig that scanned.")] = None,
-    preset: Annotated[str | None, typer.Option(help="Name of the preset that was asked for.")] = None,
+    preset: Annotated[str | None, typer.Option(help="Name of the requested preset.")] = None,
     limit: Annotated[int, typer.Option(min=1, help="How many, from the newest.")] = 20,
     service: ServiceOptions,
     as_json: AsJson = False,
@@ -44,14 +44,14 @@ def list_scans(
     from slrig.cli.display import print_json, print_table
 
     begin, end = (None if each is None else each.astimezone().isoformat() for each in (since, until))
-    asked = given(name=name, state=state, since=begin, until=end, rig=rig, preset=preset)
+    named = given(name=name, state=state, since=begin, until=end, rig=rig, preset=preset)
     with service.client() as client:
-        found = [each for each, _ in zip(_listed(client, limit=min(limit, _PAGE), **asked), range(limit), strict=False)]
+        found = [each for each, _ in zip(_listed(client, limit=min(limit, _PAGE), **named), range(limit), strict=False)]
     if as_json:
         print_json({"scans": found})
         return
     if not found:
-        typer.echo("no such scan" if asked else "no scans; make one with: slrig scan --output FOLDER")
+        typer.echo("no such scan" if named else "no scans; make one with: slrig scan --output FOLDER")
         return
     heads = ("id", "name", "created", "state", Column("triangles", justify="right"), Column("σ mm", justify="right"))
     print_table(heads, [_row(each) for each in found])
@@ -142,9 +142,9 @@ def _called(scan: Mapping[str, Any]) -> str:
     return f"{scan['label'] or 'scan'} ({scan['id'][:8]})"
 
 
-def _listed(client: Client, **asked: Any) -> Iterator[dict[str, Any]]:
-    """The scans that are asked for, from new to old, page after page."""
-    page = client.scans.list(**asked)
+def _listed(client: Client, **named: Any) -> Iterator[dict[str, Any]]:
+    """The scans that match, from new to old, page after page."""
+    page = client.scans.list(**named)
     yield from page["scans"]
     while page["next"] is not None:
         page = client.get(page["next"])
@@ -152,7 +152,7 @@ def _listed(client: Client, **asked: Any) -> Iterator[dict[str, Any]]:
 
 
 def _chosen(client: Client, word: str) -> Mapping[str, Any]:
-    """The one scan that has this name, or whose id begins so. Raises JobNotFoundError."""
+    """The one scan with this name or beginning of its id. Raises JobNotFoundError."""
     found = [
         each
         for each in _listed(client, name=word, limit=_PAGE)

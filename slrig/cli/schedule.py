@@ -30,7 +30,7 @@ def add(
         str, typer.Argument(metavar="CRON", help="Five fields: '30 6 * * mon-fri' is 06:30 on working days.")
     ],
     task: Annotated[str, typer.Argument(metavar="TASK", help="verification, calibration or acceptance.")],
-    time_zone: Annotated[str, typer.Option(help="Whose clocks; a name such as Europe/Berlin.")] = "UTC",
+    time_zone: Annotated[str, typer.Option(help="Time zone of the expression, such as Europe/Berlin.")] = "UTC",
     label: Annotated[str | None, typer.Option(help="Free text, to find the schedule again.")] = None,
     option: Annotated[
         list[str] | None, typer.Option(help="Of the task, as name=value; the value is JSON or text. May be repeated.")
@@ -46,7 +46,7 @@ def add(
     service: ServiceOptions,
     as_json: AsJson = False,
 ) -> None:
-    """Have a service do something by the clock.
+    """Schedule work of a service.
 
     Shows the next five times.
     """
@@ -60,7 +60,7 @@ def add(
         **given(label=label, grace_s=grace_s, retry_s=retry_s),
     }
     with service.client() as client:
-        _tell_schedule(client.post("/schedule", request), as_json=as_json)
+        _print_schedule(client.post("/schedule", request), as_json=as_json)
 
 
 @app.command(name="list")
@@ -125,7 +125,7 @@ def runs(
 @app.command()
 @grouped
 def pause(schedule: ScheduleId, service: ServiceOptions) -> None:
-    """Let nothing become due until the schedule is resumed."""
+    """Pause a schedule until it is resumed."""
     with service.client() as client:
         client.post(f"{_path(client, schedule)}/pause", None)
     typer.echo("paused")
@@ -136,16 +136,16 @@ def pause(schedule: ScheduleId, service: ServiceOptions) -> None:
 def resume(schedule: ScheduleId, service: ServiceOptions) -> None:
     """Go on after a pause."""
     with service.client() as client:
-        _tell_schedule(client.post(f"{_path(client, schedule)}/resume", None))
+        _print_schedule(client.post(f"{_path(client, schedule)}/resume", None))
 
 
 @app.command()
 @grouped
 def cancel(schedule: ScheduleId, service: ServiceOptions) -> None:
-    """Have the run under way end early. The schedule stays as it is."""
+    """Request the early end of the run under way. The schedule stays as it is."""
     with service.client() as client:
         client.post(f"{_path(client, schedule)}/cancel", None)
-    typer.echo("the run was asked to end")
+    typer.echo("the end of the run was requested")
 
 
 @app.command()
@@ -157,9 +157,9 @@ def remove(schedule: ScheduleId, service: ServiceOptions) -> None:
     typer.echo("removed")
 
 
-def _options(told: list[str]) -> dict[str, Any]:
+def _options(given: list[str]) -> dict[str, Any]:
     options: dict[str, Any] = {}
-    for each in told:
+    for each in given:
         name, equals, value = each.partition("=")
         if not name or not equals:
             message = f"--option: expected name=value, found '{each}'"
@@ -176,11 +176,11 @@ def _path(client: Client, beginning: str) -> str:
 
 
 def _chosen(client: Client, beginning: str) -> Mapping[str, Any]:
-    """The schedule whose id begins so."""
+    """The schedule with this beginning of its id."""
     return by_beginning(client.get("/schedule")["schedules"], beginning, "schedule", ScheduleNotFoundError)
 
 
-def _tell_schedule(schedule: Mapping[str, Any], *, as_json: bool = False) -> None:
+def _print_schedule(schedule: Mapping[str, Any], *, as_json: bool = False) -> None:
     if as_json:
         from slrig.cli.display import print_json
 

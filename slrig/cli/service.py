@@ -126,14 +126,14 @@ def serve(
         list[str] | None, typer.Option(help="A name by which clients may call this machine; may be repeated.")
     ] = None,
     new_key: Annotated[bool, typer.Option("--new-key", help="Make a new API key; the old one stops working.")] = False,
-    no_key: Annotated[bool, typer.Option("--no-key", help="Ask for no API key; only on this machine.")] = False,
+    no_key: Annotated[bool, typer.Option("--no-key", help="Need no API key; only on this machine.")] = False,
     until_eof: Annotated[bool, typer.Option("--until-eof", help="Stop when standard input ends.")] = False,
 ) -> None:
     """Start the service: it holds the rig and scans over HTTP."""
     from slrig.api.server import serve as run_service
     from slrig.config import read_rig, read_settings
 
-    told = given(
+    options = given(
         host=host,
         port=port,
         data_dir=data,
@@ -143,7 +143,7 @@ def serve(
         compute_store=store,
         compute_certificates=certificates,
     )
-    chosen = read_settings(settings, **told)
+    chosen = read_settings(settings, **options)
     if is_example(rig):
         rig = _own_copy(rig, chosen.data_dir)
     run_service(chosen, read_rig(rig), new_key=new_key, until_eof=until_eof, say=typer.echo)
@@ -167,7 +167,7 @@ Data = Annotated[
         help="Data folder of the service. Default: SLRIG_DATA_DIR, or ~/.local/share/slrig.", show_default=False
     ),
 ]
-Name = Annotated[str, typer.Argument(metavar="NAME", help="Whose key it is: a person, or a program.")]
+Name = Annotated[str, typer.Argument(metavar="NAME", help="Owner of the key: a person, or a program.")]
 
 
 def _ring(data: Path | None) -> KeyRing:
@@ -186,7 +186,7 @@ def add(
     name: Name,
     scope: Annotated[
         list[KeyScope] | None,
-        typer.Option(help="What for; may be repeated. Every key may look. Default: scan."),
+        typer.Option(help="A permission; may be repeated. Every key may read. Default: scan."),
     ] = None,
     days: Annotated[float | None, typer.Option(min=0.001, help="After how many days it ends. Default: never.")] = None,
     data: Data = None,
@@ -205,7 +205,7 @@ def add(
 @key_app.command(name="list")
 @grouped
 def list_keys(data: Data = None, as_json: AsJson = False) -> None:
-    """List the keys: whose, what for, until when. The keys themselves are kept nowhere."""
+    """List the keys: owner, scopes, end. The keys themselves are kept nowhere."""
     from slrig.cli.display import print_json, print_table
     from slrig.jobs.records import utc_now
 
@@ -231,9 +231,9 @@ def list_keys(data: Data = None, as_json: AsJson = False) -> None:
 @key_app.command()
 @grouped
 def revoke(name: Name, data: Data = None) -> None:
-    """Have a key open nothing any more, from the next request on."""
+    """Revoke a key, from the next request on."""
     _ring(data).revoke(name)
-    typer.echo(f"the key of '{name}' opens nothing any more")
+    typer.echo(f"the key of '{name}' is revoked")
 
 
 def backup(
@@ -254,14 +254,14 @@ def backup(
     from slrig.jobs.backup import back_up
 
     folder = read_settings(settings, **given(data_dir=data)).data_dir
-    _tell(back_up(folder, to, previous=link_previous), f"backup of {folder} in {to}", as_json=as_json)
+    _print_manifest(back_up(folder, to, previous=link_previous), f"backup of {folder} in {to}", as_json=as_json)
 
 
 def check(
     data: Annotated[Path, typer.Argument(metavar="DATA", help="The data folder of a service.")],
     as_json: AsJson = False,
 ) -> None:
-    """Compare every file of a data folder with what was committed.
+    """Compare every file of a data folder with its committed digest.
 
     Also while the service runs. Exits with 1 if a file is damaged.
     """
@@ -269,21 +269,21 @@ def check(
     from slrig.jobs.data_folder import SCANS, check_files
 
     if not (data / SCANS).is_dir():
-        message = f"{data}: no data folder of slrig; expected one with a folder '{SCANS}'."
+        message = f"{data}: not a data folder of slrig; expected one with a folder '{SCANS}'."
         raise ConfigError(message)
-    looked_at, found = 0, {}
+    checked, found = 0, {}
     for path, cause in check_files(data):
-        looked_at += 1
+        checked += 1
         if cause is not None:
             found[path] = cause
     if as_json:
         from slrig.cli.display import print_json
 
-        print_json({"files": looked_at, "damaged": found})
+        print_json({"files": checked, "damaged": found})
     else:
         for path, cause in found.items():
             typer.echo(f"{path} {cause}")
-        typer.echo(f"{looked_at} files of finished jobs, {len(found) or 'none'} damaged")
+        typer.echo(f"{checked} files of finished jobs, {len(found) or 'none'} damaged")
         if found:
             typer.echo("Where the bundle is whole: POST /scan/ID/reconstruct. Otherwise restore a backup.", err=True)
     if found:
@@ -301,10 +301,10 @@ def restore(
     """
     from slrig.jobs.backup import restore as replacebackup
 
-    _tell(replacebackup(source, data), f"{data} made from {source}", as_json=as_json)
+    _print_manifest(replacebackup(source, data), f"{data} made from {source}", as_json=as_json)
 
 
-def _tell(manifest: Manifest, what: str, *, as_json: bool) -> None:
+def _print_manifest(manifest: Manifest, what: str, *, as_json: bool) -> None:
     if as_json:
         from slrig.cli.display import print_json
 
@@ -328,7 +328,7 @@ def _tell(manifest: Manifest, what: str, *, as_json: bool) -> None:
 def fleet(
     catalogue: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Ask this database itself, postgresql://HOST:PORT/DATABASE."),
+        typer.Option(metavar="ADDRESS", help="Read this database itself, postgresql://HOST:PORT/DATABASE."),
     ] = None,
     settings: Annotated[Path | None, typer.Option(help="TOML file with its settings, as a service has them.")] = None,
     *,
@@ -337,8 +337,8 @@ def fleet(
 ) -> None:
     """List the rigs that share a catalogue.
 
-    How each is, its health, its last scan and its backlog. Asks a service, or the catalogue itself where that is named,
-    here or as SLRIG_CATALOGUE.
+    State, health, last scan and backlog of each. Reads a service, or the catalogue itself where that is named, here or
+    as SLRIG_CATALOGUE.
     """
     from slrig.cli.display import print_json, print_table
 
@@ -356,7 +356,7 @@ def fleet(
 
 
 def _of_catalogue(address: str | None, settings: Path | None) -> Mapping[str, Any] | None:
-    """What the catalogue of the settings says; None where they name none."""
+    """The content of the catalogue of the settings; None where they name none."""
     from pydantic import TypeAdapter
 
     from slrig.catalogue.store import Fleet, catalogue_of
@@ -392,7 +392,7 @@ def _row(rig: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _ago(seconds: float) -> str:
-    """How long ago something was.
+    """Time since a moment, as text.
 
     >>> _ago(8.2), _ago(200.0), _ago(7200.0), _ago(300000.0)
     ('8 s ago', '3 min ago', '2 h ago', '3 days ago')

@@ -377,7 +377,7 @@ def test_what_was_found_is_proposed_and_can_be_read_again(tmp_path: Path) -> Non
     refused = run(*ask)
     sheet = tmp_path / "my bundle-sheet.png"
     assert refused.exit_code == 2
-    assert f"Look at {sheet}; if it is right, add --yes" in " ".join(refused.stderr.split())
+    assert f"Check {sheet}; if it is right, add --yes" in " ".join(refused.stderr.split())
     assert cv2.imread(str(sheet)) is not None
     taken = run(*ask, "--yes", "--save-list", tmp_path / "list.csv")
     assert taken.exit_code == 0, taken.output

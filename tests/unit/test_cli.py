@@ -36,12 +36,12 @@ from slrig.cli.commands import INTERRUPTED, app
 from slrig.cli.display import ProgressDisplay, print_json, print_table, quality_lines
 from slrig.cli.options import AcceptanceOptions, ServiceOptions
 from slrig.cli.scan import (
+    print_result,
     remove_earlier,
     require_sound,
     scan_with,
     series_with,
     still_missing,
-    tell_result,
 )
 from slrig.client import Client, ScanJob
 from slrig.config import read_rig
@@ -353,7 +353,7 @@ def test_result_is_shown_with_its_files_and_its_quality(tmp_path: Path, capsys: 
     files = ("mesh.ply", "mesh.obj", "rejected-left.png")
     for name in (*files, "report.json"):
         (tmp_path / name).write_bytes(b"of this scan or of an earlier one")
-    tell_result({}, tmp_path, files=files)
+    print_result({}, tmp_path, files=files)
     assert [line.split() for line in capsys.readouterr().out.splitlines()] == [
         ["mesh", str(tmp_path / "mesh.ply")],
         ["mesh.obj", str(tmp_path / "mesh.obj")],

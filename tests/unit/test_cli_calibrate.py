@@ -18,7 +18,7 @@ from slrig.api.calibration import ComparisonBody
 from slrig.bundle import read_calibration, read_opencv_calibration, write_calibration, write_opencv_calibration
 from slrig.calibrate.report import summary
 from slrig.calibration.board import DEFAULT_BOARD, BoardShape
-from slrig.cli.calibrate_walk import Walk, opened, tell_result
+from slrig.cli.calibrate_walk import Walk, opened, print_result
 from slrig.cli.commands import INTERRUPTED
 from slrig.cli.options import ServiceOptions
 from slrig.client import Client
@@ -268,7 +268,7 @@ def test_board_that_is_not_named_is_the_usual_one(tmp_path: Path) -> None:
 
 def test_screen_fits_on_one_and_holds_the_figures() -> None:
     stream = io.StringIO()
-    tell_result({**summary(solved_result()), "refused": {"pose_20": "no board"}}, Console(file=stream, width=100))
+    print_result({**summary(solved_result()), "refused": {"pose_20": "no board"}}, Console(file=stream, width=100))
     text = stream.getvalue()
     assert len(text.splitlines()) <= 40
     figures = summary(solved_result())
@@ -328,7 +328,7 @@ def test_walk_shoots_solves_and_has_scans_use_the_result(desk: Desk, walked: Cal
     assert text.count("move it to the lower right corner") == 2
     # A pose that was refused covers nothing new: the picture stays away.
     assert text.count("17% of the cells") == 1
-    assert "have scans use it" in text
+    assert "use it for scans" in text
     rows = [line for line in text.splitlines() if "·" in line or "[·]" in line]
     assert rows[0].startswith(" 1  1  1  ·  ·  · ")
     assert rows[2].startswith(" ·  ·  ·  ·  ·  · ")

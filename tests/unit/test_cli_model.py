@@ -156,7 +156,7 @@ def test_what_is_missing_is_said(scans: Path, tmp_path: Path) -> None:
         ([folder, *to, "--markers"], "expected the frames that it was made of"),
         ([folder, *to, "--markers", "--unknown"], "leave out the other one"),
         ([folder, *to, *STAGE, "--unknown"], "found --angle"),
-        ([folder, *to, "--unknown", "--dictionary", "DICT_4X4_50"], "expected --markers beside it"),
+        ([folder, *to, "--unknown", "--dictionary", "DICT_4X4_50"], "expected --markers with it"),
     ):
         refused = model(*words)
         assert (refused.exit_code, expected in refused.stderr) == (2, True), (words, refused.output)

@@ -34,7 +34,7 @@ from slrig.accept.plan import (
 from slrig.accept.report import document, report_html
 from slrig.accept.store import AcceptanceRecord, AcceptanceState, record_from_json, record_json
 from slrig.calibration.artefacts import Decision
-from slrig.cli.accept import Person, measure_positions, tell
+from slrig.cli.accept import Person, measure_positions, print_result
 from slrig.devices import Rig
 from slrig.errors import (
     CalibrationError,
@@ -435,7 +435,7 @@ def test_wrong_scale_is_shown_on_terminal_and_page() -> None:
 
     for each, wrong in ((result(0.002), True), (result(0.0), False)):
         terminal = Console(file=StringIO(), width=300)
-        tell(each, terminal)
+        print_result(each, terminal)
         page = report_html(each, lambda _: POINTS)
         assert isinstance(terminal.file, StringIO)
         for text in (terminal.file.getvalue(), page):

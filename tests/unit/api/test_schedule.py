@@ -256,7 +256,7 @@ def test_command_pauses_resumes_cancels_and_removes(
     stop = Stop()
     # As a run under way leaves it there.
     monkeypatch.setitem(served.service.tasks._stops, UUID(made["id"]), stop)
-    assert done("cancel", beginning) == "the run was asked to end\n"
+    assert done("cancel", beginning) == "the end of the run was requested\n"
     assert stop._requested
     assert kept(client) == [made]
     assert f"there are: {beginning}" in refused(run("pause", "zzz"))

@@ -30,7 +30,7 @@ from slrig.calibration.board import BoardShape, ViewQuality
 from slrig.calibration.health.verification import verify_by_board
 from slrig.calibration.judgement import Grade
 from slrig.calibration.solution import PROJECTOR
-from slrig.cli.calibrate_walk import tell_result
+from slrig.cli.calibrate_walk import print_result
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, Size
 from tests.unit.calibrate.solved import (
@@ -347,7 +347,7 @@ def test_what_is_not_known_is_null_in_json_and_no_number_on_screen_and_page() ->
     assert document["baselines"] == []
     assert 0 < document["odd_even"]["ratio"] < 3
     stream = io.StringIO()
-    tell_result(document, Console(file=stream, width=200))
+    print_result(document, Console(file=stream, width=200))
     shown = [line.rstrip() for line in stream.getvalue().splitlines()]
     assert any(line.endswith("(1 σ) across the line of sight by the calibration") for line in shown)
     page = Page(report_html(of_one(), poses_of_one()[0], board=CHESSBOARD, title="one camera"))

@@ -297,7 +297,7 @@ def test_conform_prints_faults_and_remedies(
     document = json.loads(shown.stdout)
     assert (document["rig"], document["conforms"], document["score"]) == ("model", passed == 2, passed / 2)
     assert (document["passed"], document["applicable"]) == (passed, 2)
-    assert "is no data folder of slrig serve" in shown.stderr
+    assert "is not a data folder of slrig serve" in shown.stderr
 
 
 def test_a_check_that_hangs_ends_the_job_and_leaves_the_checks_before_it_on_record(

@@ -345,7 +345,7 @@ def test_check_names_each_damaged_file_of_a_data_folder(store: JobStore, folder:
     }
     (places[1] / FILES).write_bytes(b"{")
     assert f"scans/{places[1].name}/{FILES} cannot be read" in slrig("check", folder.root).stdout
-    assert "no data folder" in refused(slrig("check", folder.root / "scans"))
+    assert "not a data folder" in refused(slrig("check", folder.root / "scans"))
 
 
 def test_a_damaged_file_is_in_no_backup(tmp_path: Path, store: JobStore, folder: DataFolder) -> None:
