@@ -35,7 +35,7 @@ Measured = Annotated[float, BeforeValidator(lambda given: math.nan if given is N
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What one capture showed.
+    """Errors of one capture.
 
     step : name of the position; take : how many times it was measured before. errors_mm : by quantity. noise_mm : root
     mean square of the standard deviations that the scan states for the points used; sigma_mm, dispersion_mm : standard
@@ -60,7 +60,7 @@ class Reading:
 
 
 def errors_by_step(readings: Sequence[Reading], quantity: Quantity) -> dict[str, list[float]]:
-    """The errors of a quantity by position, mm, of each capture there; positions that do not tell it are left out."""
+    """The errors of a quantity by position, mm, of each capture there; positions without it are left out."""
     found: dict[str, list[float]] = {}
     for each in readings:
         if quantity in each.errors_mm:
@@ -151,15 +151,15 @@ FORMULA = "U = sqrt(U_certificate^2 + U_form^2 + U_temperature^2 + U_fixture^2)"
 _HALF_TO_DEVIATION = 1 / math.sqrt(3)  # of a rectangular distribution
 _EXPANSION_WITHIN_PER_K = 1.0e-6
 """Steels differ by so much (ISO 3650); other materials are taken to be known no better."""
-_TOLD_WITHIN_K = 1.0
+_STATED_WITHIN_K = 1.0
 """Chosen: a room's thermometer, and an artefact that has not quite taken the room's temperature."""
 _ROOM_WITHIN_K = 5.0
-"""Chosen: a room whose temperature nobody read, about the reference of 20 °C."""
+"""Chosen: a room of unknown temperature, about the reference of 20 °C."""
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorUncertainty:
-    """Expanded uncertainties (k = 2) of an error, mm, by cause; None where the certificate's was not told."""
+    """Expanded uncertainties (k = 2) of an error, mm, by cause; None where the certificate's is not stated."""
 
     certificate_mm: float | None
     form_mm: float | None
@@ -168,15 +168,15 @@ class ErrorUncertainty:
 
     @property
     def expanded_mm(self) -> float:
-        """U by `FORMULA`; what was not told is left out."""
+        """U by `FORMULA`, without parts that are not stated."""
         return math.hypot(self.certificate_mm or 0.0, self.form_mm or 0.0, self.temperature_mm, self.fixture_mm)
 
 
 def error_uncertainty(quantity: Quantity, artefacts: Artefacts) -> ErrorUncertainty:
-    """What the artefact of a quantity brings into its error.
+    """Contribution of the artefact of a quantity to its error.
 
     An artefact out of form by F has u = F / 2 (ISO/TS 23165), with k = 2 F itself; a sphere's diameter found from the
-    part that is seen may differ from the certified one by as much. A length L of thermal expansion a at a temperature t
+    visible part may differ from the certified one by as much. A length L of thermal expansion a at a temperature t
     has u^2 = (L a u(t))^2 + (L (t - 20 °C) u(a))^2.
     """
     certified = {Quantity.SIZE: artefacts.diameter, Quantity.SPACING: artefacts.distance}.get(quantity)
@@ -196,23 +196,23 @@ def error_uncertainty(quantity: Quantity, artefacts: Artefacts) -> ErrorUncertai
 def _temperature_mm(length_mm: float, artefacts: Artefacts) -> float:
     if artefacts.expansion_per_k == 0:
         return 0.0
-    told = artefacts.temperature_c is not None
+    stated = artefacts.temperature_c is not None
     warmer_k = 0.0 if artefacts.temperature_c is None else artefacts.temperature_c - REFERENCE_C
-    by_temperature = artefacts.expansion_per_k * (_TOLD_WITHIN_K if told else _ROOM_WITHIN_K)
+    by_temperature = artefacts.expansion_per_k * (_STATED_WITHIN_K if stated else _ROOM_WITHIN_K)
     by_expansion = warmer_k * _EXPANSION_WITHIN_PER_K
     return 2 * length_mm * math.hypot(by_temperature, by_expansion) * _HALF_TO_DEVIATION
 
 
 _FEWEST_PLACES = 3
-"""Chosen: in fewer, a volume that is bent cannot be told from one that is too large."""
+"""Chosen: in fewer, a bent volume cannot be distinguished from one that is too large."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """share : by how much a bar measures longer than its certificate says, over its length, the mean of all places.
+    """share : excess of a bar's measured length over its certificate's, over its length, the mean of all places.
 
-    sigma : of that, from how places differ and what is known of the bar; places : where it was measured. words : what
-    is wrong, and what to do; None where nothing is.
+    sigma : of that, from the differences of places and the bar's uncertainty; places : number of places where it was
+    measured. words : the fault and its remedy; None without one.
     """
 
     share: float
@@ -224,7 +224,7 @@ class Scale:
 def scale_by_bar(readings: Sequence[Reading], artefacts: Artefacts) -> Scale | None:
     """The scale that the bar's readings show; None where the bar was measured in fewer than three places.
 
-    It is told from 0.1 % and from five of its standard deviations on, as the scale of a calibration is.
+    It is reported from 0.1 % and from five of its standard deviations on, as the scale of a calibration is.
     """
     by_place = errors_by_step(readings, Quantity.SPACING)
     if len(by_place) < _FEWEST_PLACES:
@@ -237,20 +237,20 @@ def scale_by_bar(readings: Sequence[Reading], artefacts: Artefacts) -> Scale | N
     if abs(share) <= max(MIN_SCALE_ERROR, SCALE_SIGMAS * sigma):
         return Scale(share, sigma, len(shares), None)
     longer, smaller = ("longer", "smaller") if share > 0 else ("shorter", "larger")
-    words = (
+    message = (
         f"the bar measures {abs(share):.2%} ± {100 * sigma:.1g}% {longer} than its certificate says, in all of "
         f"{len(shares)} places: everything does. The squares of the board that the rig was calibrated with are so much "
         f"{smaller} than they were said to be, or a device was moved since; measure both rulers of the board, give "
         f"{setting('measured_mm')}, and calibrate again"
     )
-    return Scale(share, sigma, len(shares), words)
+    return Scale(share, sigma, len(shares), message)
 
 
 @dataclass(frozen=True, slots=True)
 class QuantityVerdict:
     """One quantity over all positions. error_mm : of the reading with the largest, which is that of `step`, `take`.
-    scatter_mm : the standard deviation of repeated captures, NaN where none were made; repeats : captures that tell it.
-    It is told and decides nothing: the rig's own scatter is in its errors.
+    scatter_mm : the standard deviation of repeated captures, NaN where none were made; repeats : number of those.
+    It is shown and decides nothing: the rig's own scatter is in its errors.
     """
 
     quantity: Quantity
@@ -279,9 +279,9 @@ class AcceptanceResult:
     @property
     def decision(self) -> Decision:
         """Fails if any quantity fails, passes if all pass."""
-        told = {verdict.decision for verdict in self.verdicts}
+        found = {verdict.decision for verdict in self.verdicts}
         for worst in (Decision.FAILS, Decision.UNDECIDED):
-            if worst in told:
+            if worst in found:
                 return worst
         return Decision.PASSES
 
@@ -297,9 +297,9 @@ class AcceptanceResult:
 
 
 def verdicts(readings: Sequence[Reading], plan: AcceptancePlan) -> tuple[QuantityVerdict, ...]:
-    """What is decided of each quantity that was measured."""
-    told = {quantity for each in readings for quantity in each.errors_mm}
-    return tuple(_verdict(quantity, readings, plan) for quantity in Quantity if quantity in told)
+    """Verdict on each measured quantity."""
+    measured = {quantity for each in readings for quantity in each.errors_mm}
+    return tuple(_verdict(quantity, readings, plan) for quantity in Quantity if quantity in measured)
 
 
 def _verdict(quantity: Quantity, readings: Sequence[Reading], plan: AcceptancePlan) -> QuantityVerdict:

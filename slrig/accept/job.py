@@ -60,7 +60,7 @@ def bundle_name(step: Step, take: int) -> str:
 
 
 def capture_take(rig: Rig, plan: AcceptancePlan, bundle: Path, listener: Listener) -> None:
-    """Record a bundle of the artefact that stands before the rig. Raises CalibrationError, and as a scan."""
+    """Record a bundle of the artefact before the rig. Raises CalibrationError, and as a scan."""
     calibration = required_calibration(rig)
     # The test must not use what a rendered rig knows of its scene; and the noise of a point, stated next to its form,
     # leaves out the calibration's own error, which the form shows.
@@ -87,7 +87,7 @@ def evaluated(
 
 
 def move_artefact(rig: Rig, plan: AcceptancePlan, step: Step) -> None:
-    """Have the rig's positioner bring the artefact of a step to its place: its poses are called as the steps are.
+    """Move the artefact of a step to its place by the rig's positioner, with poses of the steps' names.
     Raises UnsupportedByDeviceError if it does not know a position of the plan.
     """
     poses = () if rig.positioner is None else tuple(rig.positioner.poses)
@@ -96,7 +96,7 @@ def move_artefact(rig: Rig, plan: AcceptancePlan, step: Step) -> None:
         has = f"a positioner with {', '.join(poses)}" if poses else "no positioner"
         message = (
             f"rig '{rig.name}' has {has}, and the test needs the positions {', '.join(missing)}; place the artefacts "
-            f"by hand (without {setting('scripted')}), or name the positioner's poses so"
+            f"manually (without {setting('scripted')}), or name the positioner's poses so"
         )
         raise UnsupportedByDeviceError(message)
     rig.positioner.move(poses.index(step.name))
@@ -113,7 +113,7 @@ def required_calibration(rig: Rig) -> Calibration:
 SCENE = "acceptance-scene.toml"
 _ALBEDO = 0.8
 _BAR_SHARE = 0.25  # of a ball's radius: the rod between them
-_ASIDE = 20.0  # diagonals of the volume: where artefacts stand that are not measured
+_ASIDE = 20.0  # diagonals of the volume: distance of artefacts that are not measured
 
 
 def scripted_config(config: RigConfig, plan: AcceptancePlan, folder: Path) -> RigConfig:
@@ -123,8 +123,8 @@ def scripted_config(config: RigConfig, plan: AcceptancePlan, folder: Path) -> Ri
     """
     if config.head is None or "scene" not in config.head.options:
         message = (
-            f"rig '{config.name}' is not rendered and nobody moves its artefacts by script; leave "
-            f"{setting('scripted')} out and place them by hand"
+            f"rig '{config.name}' is not rendered and nothing moves its artefacts by script; leave "
+            f"{setting('scripted')} out and place them manually"
         )
         raise UnsupportedByDeviceError(message)
     path = (folder / SCENE).resolve()
@@ -172,7 +172,7 @@ def _pose(step: Step) -> dict[str, object]:
 @dataclass(frozen=True, slots=True)
 class PositionJob(Job):
     """One position of an acceptance test, the `group`, with its repeats. scripted : the rig's positioner brings the
-    artefact there, and the next position follows; else it stands in its place.
+    artefact there, and the next position follows; else it is in its place.
     """
 
     kind: ClassVar[JobKind] = JobKind.POSITION
@@ -198,7 +198,7 @@ class PositionJob(Job):
         return 0.5
 
     def capture(self, rig: RigSession, run: JobRun) -> None:
-        """Have the artefact placed, and record a bundle of each capture."""
+        """Place the artefact if scripted, and record a bundle of each capture."""
         opened, record = rig.open_whole(), read_test(_test_of(run))
         plan = record.plan
         if required_calibration(opened).solve_id != record.calibration:
@@ -308,9 +308,9 @@ class AcceptanceTests:
     def measure(
         self, test_id: UUID, *, wait: bool, scripted: bool, key: str | None = None, holder: Holder | None = None
     ) -> JobRecord:
-        """Have the next position measured, or, scripted, all that are left; return the job at once.
+        """Measure the next position, or, scripted, all that are left; return the job at once.
 
-        By hand, the artefact is to stand in its place. `wait` lets it stand in line behind other work. key : the
+        Unless scripted, the artefact has to be in its place. `wait` allows it to wait behind other work. key : the
         idempotency key of the request, reserved. holder : whom a refusal names meanwhile; None the test.
 
         Raises JobNotFoundError, ScanStateError if there is no such test, or it is being measured, or it is over;
@@ -378,7 +378,7 @@ class AcceptanceTests:
         )  # fmt: skip
 
     def folder(self, test_id: UUID) -> Path:
-        """Where reports and points of a test lie."""
+        """Folder of the reports and points of a test."""
         return self._store.folder(test_id)
 
     def _found(self, test_id: UUID) -> AcceptanceRecord:

@@ -25,13 +25,13 @@ Numbers = Annotated[FloatArray, PlainValidator(lambda given: np.array(given, np.
 """An array, float64, that pydantic reads from lists."""
 
 WANTED_SHARE = 1 / 5000
-"""Of L0: how far off a point may be where nobody says what the rig is for."""
+"""Tolerance of a point as a share of L0, where none is given."""
 
 USUAL_REPEATS = 3
 STEEL_PER_K = 11.5e-6
-"""Thermal expansion of an artefact where it is not told: steel's (gauge blocks, ISO 3650: 11.5e-6 +- 1.0e-6)."""
+"""Thermal expansion of an artefact where it is not given: steel's (gauge blocks, ISO 3650: 11.5e-6 +- 1.0e-6)."""
 REFERENCE_C = 20.0
-"""What certified lengths hold at (ISO 1)."""
+"""Reference temperature of certified lengths (ISO 1)."""
 _MOST_EXPANSION_PER_K = 1e-3  # ten times a plastic's: more is a slip of units
 _SPHERE_SHARES = (0.02, 0.2)
 _BAR_SHARE, _PLANE_SHARE, _PLANE_WIDTH_MM = 0.3, 0.5, 50.0
@@ -39,7 +39,7 @@ _MADE_SPHERE_SHARE, _MADE_BAR_SHARE, _MADE_PLANE_SHARES = 0.11, 0.4, (0.6, 0.42)
 
 
 class Artefact(StrEnum):
-    """What is measured."""
+    """The measured artefacts."""
 
     SPHERE = "sphere"
     BAR = "bar"
@@ -47,7 +47,7 @@ class Artefact(StrEnum):
 
 
 class Quantity(StrEnum):
-    """What is told of a rig: probing error form and size, sphere spacing error, flatness error."""
+    """The errors of a rig: probing error form and size, sphere spacing error, flatness error."""
 
     FORM = "PF"
     SIZE = "PS"
@@ -67,7 +67,7 @@ class Quantity(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Certified:
-    """A certified value and its expanded uncertainty (k = 2), mm. None: the certificate's was not told."""
+    """A certified value and its expanded uncertainty (k = 2), mm. None: the certificate's is not stated."""
 
     value_mm: float
     uncertainty_mm: float | None = None
@@ -80,8 +80,8 @@ class Artefacts:
     diameter : of the sphere. distance : of the bar's ball centres; its balls have bar_diameter_mm, or the sphere's.
     plane_mm : length and width. sphere_form_mm, plane_form_mm : by how much the artefact itself is out of form, the
     certificate's uncertainty of that included. certificate : as a person notes it. temperature_c : the artefacts', None
-    where not told; expansion_per_k : of their material, 0 if they have none. fixture_mm : by how much one may move or
-    bend where it stands while it is captured, an expanded uncertainty (k = 2).
+    where not known; expansion_per_k : of their material, 0 if they have none. fixture_mm : by how much one may move or
+    bend in its place while it is captured, an expanded uncertainty (k = 2).
     """
 
     diameter: Certified
@@ -101,7 +101,7 @@ class Artefacts:
         return self.diameter.value_mm if self.bar_diameter_mm is None else self.bar_diameter_mm
 
     def expanded_mm(self, certified: Certified) -> float:
-        """A certified length as it is at the temperature told."""
+        """A certified length at the artefacts' temperature."""
         warmer_k = 0.0 if self.temperature_c is None else self.temperature_c - REFERENCE_C
         return certified.value_mm * (1 + self.expansion_per_k * warmer_k)
 
@@ -132,7 +132,7 @@ class Step:
     """One prescribed position. name : "sphere-1" and so on, as a positioner's pose may be called.
 
     centre_mm : (3,) float64, of the artefact in the world; axis : (3,) float64, unit: along the bar, or the plane's
-    normal towards the devices. words : what a person is to do.
+    normal towards the devices. words : instruction for a person.
     """
 
     name: str
@@ -214,7 +214,7 @@ def exact_artefacts(volume_mm: FloatArray) -> Artefacts:
 
 
 def _certified(artefacts: Artefacts) -> dict[str, float | None]:
-    """What a certificate tells the uncertainty of; None where it was not told."""
+    """Uncertainties of a certificate; None where they are not stated."""
     return {
         "the sphere's diameter": artefacts.diameter.uncertainty_mm,
         "the bar's distance": artefacts.distance.uncertainty_mm,
@@ -229,7 +229,7 @@ def require_fitting(artefacts: Artefacts, volume_mm: FloatArray, *, rendered: bo
     unknown = [name for name, uncertainty in _certified(artefacts).items() if uncertainty is None]
     if unknown and not rendered:
         faults.append(
-            f"the certificate's expanded uncertainty of {', '.join(unknown)} is not told; without it nothing can "
+            f"the certificate's expanded uncertainty of {', '.join(unknown)} is not stated; without it nothing can "
             "be decided on metal: copy it from the certificate"
         )
     if faults:
@@ -299,7 +299,7 @@ def _unfit(artefacts: Artefacts, volume_mm: FloatArray) -> list[str]:
 
 _SIDES = (1.0, 0.75, 0.42)
 """Width, height and depth of a volume that is made up, as shares of its width."""
-_SEEN_SHARE = 0.03  # of an image's extent: the volume's corners stay so far inside
+_MARGIN_SHARE = 0.03  # of an image's extent: the volume's corners stay so far inside
 _HALVINGS = 40
 _STEEPEST_BAR = 0.8  # of a bar's length that lies along the depth: steeper, one ball would hide the other
 _TILT_DEG = 25.0
@@ -308,7 +308,7 @@ _NEAR = 0.15  # of the half volume: what lies nearer to the middle than this has
 _NAMES = (("left", "right"), ("upper", "lower"), ("front", "back"))
 
 _Lie = tuple[FloatArray, FloatArray, str]
-"""Where an artefact lies: a step's centre_mm, axis and words."""
+"""Position of an artefact: a step's centre_mm, axis and words."""
 
 _DIAGONALS = ((-1, -1, -1), (1, -1, -1), (-1, 1, -1), (1, 1, -1))
 _CORNERS = tuple((x, y, z) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1))
@@ -331,7 +331,7 @@ def acceptance_plan(
     """
     require_fitting(artefacts, volume_mm, rendered=rendered)
     if repeats < 1:
-        message = f"repeats: expected 1 or more, found {repeats}; 3 tell the scatter"
+        message = f"repeats: expected 1 or more, found {repeats}; 3 show the scatter"
         raise InvalidInputError(message)
     camera = next(iter(calibration.cameras.values()))
     lies = {
@@ -350,7 +350,7 @@ def acceptance_plan(
 
 def rig_volume_mm(calibration: Calibration) -> FloatArray:
     """(2, 3) float64: the working volume: the one in which the board was held, else the largest box of usual
-    proportions, about where the devices look, that all of them see. Raises InvalidInputError if there is none.
+    proportions about the point nearest to their axes that all devices see. Raises InvalidInputError if there is none.
     """
     if calibration.solved is not None:
         return calibration.solved.volume_mm
@@ -367,8 +367,8 @@ def rig_volume_mm(calibration: Calibration) -> FloatArray:
         low, high = (width, high) if all(_sees(device, corners) for device in devices) else (low, width)
     if low < 0.01 * distance_mm:
         message = (
-            "volume: the devices of this rig have no common view about the point that they look at; give the working "
-            "volume yourself, and check the calibration"
+            "volume: the devices of this rig have no common view about the point nearest to their axes; give the "
+            "working volume yourself, and check the calibration"
         )
         raise InvalidInputError(message)
     return np.stack([middle - half * low, middle + half * low])
@@ -393,15 +393,15 @@ def _sees(device: Pinhole, points_mm: FloatArray) -> bool:
         return False
     pixels = cv2.projectPoints(points_mm, turned, device.translation_mm, device.matrix, device.distortion)[0][:, 0]
     extent = np.array([device.size.width_px, device.size.height_px])
-    return bool(((pixels > _SEEN_SHARE * extent) & (pixels < (1 - _SEEN_SHARE) * extent)).all())
+    return bool(((pixels > _MARGIN_SHARE * extent) & (pixels < (1 - _MARGIN_SHARE) * extent)).all())
 
 
 def _spheres(volume_mm: FloatArray, artefacts: Artefacts, camera: Pinhole) -> Iterator[_Lie]:
     middle, room = _inside(volume_mm, artefacts.diameter.value_mm / 2)
     for place in ((0.0, 0.0, 0.0), *_CORNERS, (0.0, 0.0, -1.0)):
         centre = middle + np.array(place) * room
-        told = _where(camera, centre, volume_mm)
-        at = "in the middle" if told == "the middle" else f"at {told}"
+        name = _where(camera, centre, volume_mm)
+        at = "in the middle" if name == "the middle" else f"at {name}"
         yield centre, np.zeros(3), f"Put the sphere {at} of the volume."
 
 
@@ -440,8 +440,8 @@ def _planes(volume_mm: FloatArray, artefacts: Artefacts) -> Iterator[_Lie]:
         (0.0, (0.0, lean, -level), f"in the middle, tipped by {degrees:.0f}° about the level"),
         (0.0, (-aslant, aslant, -level), f"in the middle, turned and tipped by {degrees:.0f}° in all"),
     ]
-    for depth, normal, words in lies:
-        yield middle + np.array([0.0, 0.0, depth * half[2]]), np.array(normal), f"Put the plane {words}."
+    for depth, normal, text in lies:
+        yield middle + np.array([0.0, 0.0, depth * half[2]]), np.array(normal), f"Put the plane {text}."
 
 
 def _inside(volume_mm: FloatArray, radius_mm: float) -> tuple[FloatArray, FloatArray]:
@@ -450,10 +450,9 @@ def _inside(volume_mm: FloatArray, radius_mm: float) -> tuple[FloatArray, FloatA
 
 
 def _where(camera: Pinhole, point_mm: FloatArray, volume_mm: FloatArray) -> str:
-    """Where in the volume a point lies, as the camera sees it.
+    """Name of a point's place in the volume, as the camera sees it.
 
-    Each side of the volume is named by the camera's direction that it lies nearest to, so that a world that stands
-    otherwise is told rightly too.
+    Each side of the volume is named by the nearest direction of the camera, so that the name is right in every world.
     """
     share = (point_mm - volume_mm.mean(axis=0)) / ((volume_mm[1] - volume_mm[0]) / 2)
     sides: dict[int, str] = {}
@@ -461,8 +460,8 @@ def _where(camera: Pinhole, point_mm: FloatArray, volume_mm: FloatArray) -> str:
         along = int(np.abs(camera.rotation[:, axis]).argmax())
         if abs(share[axis]) > _NEAR:
             sides[along] = _NAMES[along][int(share[axis] * camera.rotation[along, axis] > 0)]
-    told = " ".join(sides[along] for along in (1, 0, 2) if along in sides)
-    return f"the {told}" if told else "the middle"
+    names = " ".join(sides[along] for along in (1, 0, 2) if along in sides)
+    return f"the {names}" if names else "the middle"
 
 
 Length = Annotated[float, Field(gt=0, le=100_000)]
@@ -496,7 +495,7 @@ class ArtefactsRequest(Strict):
         default=STEEL_PER_K, description="thermal expansion of the artefacts; absent, that of steel"
     )
     fixture_mm: Uncertainty = Field(
-        default=0.0, description="by how much an artefact may move or bend where it stands while it is captured (k = 2)"
+        default=0.0, description="by how much an artefact may move or bend in its place while it is captured (k = 2)"
     )
 
     def artefacts(self) -> Artefacts:
@@ -520,7 +519,7 @@ class LimitsRequest(Strict):
 
 
 class AcceptanceRequest(Strict):
-    """What to test with. Without artefacts: the exact ones of a rendered rig."""
+    """Artefacts and limits of a test. Without artefacts: the exact ones of a rendered rig."""
 
     artefacts: ArtefactsRequest | None = None
     volume_mm: tuple[Corner, Corner] | None = Field(
@@ -543,14 +542,14 @@ class AcceptanceRequest(Strict):
         if not (volume[0] < volume[1]).all():
             message = f"volume_mm: expected the least corner and then the greatest, found {volume.tolist()}"
             raise InvalidInputError(message)
-        told = self.limits.model_dump(exclude_none=True)
+        given = self.limits.model_dump(exclude_none=True)
         return acceptance_plan(
             calibration,
             volume,
             exact_artefacts(volume) if self.artefacts is None else self.artefacts.artefacts(),
             rendered=rendered,
             limits=replace(
-                usual_limits(volume, tolerance_mm if self.tolerance_mm is None else self.tolerance_mm), **told
+                usual_limits(volume, tolerance_mm if self.tolerance_mm is None else self.tolerance_mm), **given
             ),
             repeats=self.repeats,
             exposure_s=self.exposure_s,

@@ -1,4 +1,4 @@
-"""An acceptance test as one page of HTML, and as JSON for machines: the decision first, then what it stands on."""
+"""An acceptance test as one page of HTML, and as JSON for machines: the decision first, then its grounds."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MOST_CELL_PX = 12
 
 
 def write_reports(result: AcceptanceResult, folder: Path) -> None:
-    """Write report.html and, when that is there, report.json, beside the captures' points. Raises StorageError."""
+    """Write report.html and, when that is there, report.json, next to the captures' points. Raises StorageError."""
     page = report_html(result, lambda reading: kept_points(folder, reading.step, reading.take))
     write_file(folder / HTML, page.encode())
     write_report(document(result), folder / JSON)
@@ -113,7 +113,7 @@ def _capture(reading: Reading) -> dict[str, object]:
 
 
 def report_html(result: AcceptanceResult, evidence_of: Callable[[Reading], ReadingPoints]) -> str:
-    """The page. `evidence_of` is asked for the points of one reading at a time: all at once are large."""
+    """The page. `evidence_of` gives the points of one reading at a time: all at once are large."""
     plan = result.plan
     camera = next(iter(result.calibration.cameras.values()))
     artefact_of = {step.name: step.artefact for step in plan.steps}
@@ -150,8 +150,8 @@ def error_map(evidence: ReadingPoints, camera: Pinhole, *, most_mm: float) -> Pi
     Dark blue is most_mm inwards (below), yellow as much outwards.
     """
     on = np.flatnonzero(evidence.artefact > 0)
-    seen = evidence.points_mm[on] @ camera.rotation.T + camera.translation_mm
-    flat = seen[:, :2] / seen[:, 2:]
+    in_camera = evidence.points_mm[on] @ camera.rotation.T + camera.translation_mm
+    flat = in_camera[:, :2] / in_camera[:, 2:]
     low, high = flat.min(axis=0), flat.max(axis=0)
     width, height = _MAP_PX
     scale = (1 - 2 * _MARGIN_SHARE) / max((high - low)[0] / width, (high - low)[1] / height, 1e-12)
@@ -181,7 +181,7 @@ def volume_view(plan: AcceptancePlan, artefact: Artefact, *, aside: bool) -> Mar
     corner = np.array([(WIDTH - size[0]) / 2, _MARGIN])
     ball_mm = plan.artefacts.ball_mm if artefact is Artefact.BAR else plan.artefacts.diameter.value_mm
     parts = [shape("rect", x=corner[0], y=corner[1], width=size[0], height=size[1], class_="volume")]
-    # Numbers that stand in one spot are told together.
+    # Numbers in one spot are printed together.
     spots: dict[tuple[int, int], list[str]] = {}
     for step in plan.steps:
         if step.artefact is not artefact:
@@ -214,5 +214,5 @@ def _marks_mm(step: Step, plan: AcceptancePlan) -> FloatArray:
 
 
 def _number_mm(step: Step, plan: AcceptancePlan) -> FloatArray:
-    """(3,) where a position's number stands: at one end of a bar, since the middles of all diagonals are one."""
+    """(3,) the place of a position's number: at one end of a bar, since the middles of all diagonals are one."""
     return _marks_mm(step, plan)[1] if step.artefact is Artefact.BAR else step.centre_mm

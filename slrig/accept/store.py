@@ -35,7 +35,7 @@ _FORMAT = "slrig-acceptance-test"
 
 
 class AcceptanceState(StrEnum):
-    """How far a test is.
+    """State of a test.
 
     OPEN waits for its next position. INTERRUPTED was cut off by the end of the service while it was measured, and goes
     on, like an open one, when its next position is measured.
@@ -62,7 +62,7 @@ class AcceptanceRecord:
     the end.
 
     The last two are of its jobs, and not on disk. fault : why the last position was not measured, None where it was; it
-    may be measured again. progress : of what is under way.
+    may be measured again. progress : of the job under way.
     """
 
     number: int
@@ -86,14 +86,14 @@ class AcceptanceRecord:
     def from_first_take(self) -> AcceptanceRecord:
         """The record without the captures of a position that was not captured as often as planned.
 
-        Between repeats nothing may be moved, and who knows what was since: the position begins anew.
+        Between repeats nothing may be moved, which is not certain since: the position begins again.
         """
         following = self.next_take
         return self if following is None else replace(self, readings=self.readings[: len(self.readings) - following[1]])
 
 
 _AFTER = {JobState.INTERRUPTED: AcceptanceState.INTERRUPTED, JobState.CANCELLED: AcceptanceState.CANCELLED}
-"""What a test is when its newest job ended so."""
+"""State of a test by the end of its newest job."""
 
 
 def with_jobs(record: AcceptanceRecord, jobs: Sequence[JobRecord]) -> AcceptanceRecord:
@@ -121,7 +121,7 @@ def record_from_json(text: bytes, source: str) -> AcceptanceRecord:
     try:
         found = stored_json(text)
         if found["format"] != _FORMAT:
-            raise KeyError(found["format"])  # noqa: TRY301 - told with the other faults of the file
+            raise KeyError(found["format"])  # noqa: TRY301 - reported with the other faults of the file
         return _records.validate_python(found)
     except (ValueError, KeyError, TypeError) as error:
         message = f"{source} is not an acceptance test as this version of slrig writes it: {error!r}"
@@ -148,7 +148,7 @@ class AcceptanceStore:
         self._root = folder.root / "acceptance"
 
     def folder(self, test_id: UUID) -> Path:
-        """Where a test lies."""
+        """Folder of a test."""
         return self._root / str(test_id)
 
     def load(self) -> Sequence[AcceptanceRecord]:
@@ -177,13 +177,13 @@ class AcceptanceStore:
         return sorted(found, key=lambda record: record.number)
 
     def readings(self, test_id: UUID, step: str) -> list[Reading]:
-        """What was measured in a position. Raises StorageError."""
+        """Readings of a position. Raises StorageError."""
         path = self.folder(test_id) / POSITIONS / step / READINGS
         with disk_errors(path):
             return _readings.validate_json(path.read_bytes())
 
     def save(self, record: AcceptanceRecord) -> None:
-        """Put a test on record in place of what it was. Raises StorageError."""
+        """Write the record of a test. Raises StorageError."""
         place = self.folder(record.id)
         with disk_errors(place):
             (place / POSITIONS).mkdir(parents=True, exist_ok=True)
@@ -213,12 +213,12 @@ def read_test(folder: Path) -> AcceptanceRecord:
 
 
 def readings_json(readings: Sequence[Reading]) -> bytes:
-    """What was measured in a position, as JSON text."""
+    """Readings of a position, as JSON text."""
     return (json.dumps(plain(readings), indent=1, allow_nan=False) + "\n").encode()
 
 
 def points_file(step: str, take: int) -> str:
-    """Where the points of a capture lie below the folder of their test.
+    """File of the points of a capture, below the folder of their test.
 
     >>> points_file("sphere-1", 0)
     'positions/sphere-1/1.npz'

@@ -582,7 +582,7 @@ def test_metal_needs_the_certificates(rig: Rig) -> None:
     with pytest.raises(InvalidInputError, match="needs --sphere DIAMETER U"):
         plan_for(AcceptanceOptions(), metal)
     given = AcceptanceOptions(sphere_mm=(17.5, 0.001), bar_mm=(64.0, 0.002), plane_mm=(95.0, 67.0))
-    with pytest.raises(InvalidInputError, match="the sphere's form, the plane's form is not told"):
+    with pytest.raises(InvalidInputError, match="the sphere's form, the plane's form is not stated"):
         plan_for(given, metal)
     certain = replace(given, sphere_form_mm=0.001, plane_form_mm=0.002, spacing_limit_mm=0.05)
     wanted = plan_for(replace(certain, tolerance_mm=0.03), metal).limits

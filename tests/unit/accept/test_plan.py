@@ -144,7 +144,7 @@ def test_each_error_has_the_uncertainty_of_its_own_artefact() -> None:
         ({"diameter": Certified(4.0, 0.001)}, "expected a diameter of 5.2 to 52.5 mm"),
         ({"diameter": Certified(-30.0, 0.001)}, "expected a length above 0 mm, found -30 mm"),
         ({"diameter": Certified(30.0, -1.0)}, "the uncertainty of the sphere's diameter: expected 0 mm or more"),
-        ({"diameter": Certified(30.0)}, "uncertainty of the sphere's diameter is not told"),
+        ({"diameter": Certified(30.0)}, "uncertainty of the sphere's diameter is not stated"),
         ({"expansion_per_k": 11.5}, "expected 0 to 0.001 per kelvin, as steel has 1.15e-05, found 11.5"),
         ({"fixture_mm": -1.0}, "the uncertainty of the fixture: expected 0 mm or more, found -1 mm"),
         ({"distance": Certified(60.0, 0.001)}, "expected 78.7 mm or more between the balls"),
@@ -163,7 +163,7 @@ def test_artefacts_that_do_not_suit_the_volume_are_refused(change: dict[str, obj
 def test_a_refusal_lists_all_faults() -> None:
     with pytest.raises(InvalidInputError) as refused:
         plan_of(replace(GOOD, diameter=Certified(4.0), plane_mm=(100.0, 60.0)))
-    assert all(words in str(refused.value) for words in ("the sphere:", "the plane:", "is not told"))
+    assert all(words in str(refused.value) for words in ("the sphere:", "the plane:", "is not stated"))
     camera = device()
     rig = Calibration({"left": camera}, camera)
     with pytest.raises(InvalidInputError, match="least corner and then of the greatest"):
