@@ -69,17 +69,17 @@ from slrig.scan.formats import encode_coarse_glb, encode_mesh_glb, encode_view_g
 from slrig.scan.pictures import Picture, captioned, draw_scale, encode_png, shaded, side_by_side
 
 _REACH = 0.7
-"""Of a module, from a marker's corner: inwards is its border, one wide, outwards paper, by a ChArUco board's least."""
+"""Of a module, from a marker's corner: inside is its border, one wide, outside paper, by a ChArUco board's least."""
 _LEAST_HALF_PX, _MOST_HALF_PX = 3, 12
 _FEWEST_VERTICES = 30
-"""Of the mesh, on a marker: fewer tell no plane."""
+"""Fewest vertices of the mesh on a marker: fewer determine no plane."""
 _ALIKE = 30
 """So many neighbouring vertices err alike: rendered planes are as far off at their corners as that makes of them."""
 
 
 def bundle_of(mesh_file: Path) -> Path:
-    """The frames that a mesh was made of: beside it as the service and `slrig model --shoot` keep them, or the folder
-    that it lies in. Raises BundleError: there are none.
+    """The frames that a mesh was made of: next to it as the service and `slrig model --shoot` keep them, or its folder.
+    Raises BundleError: there are none.
     """
     scan = mesh_file.absolute().parent
     places = [scan / "bundle", scan, scan.parent / scan.name.replace("view-", "bundle-")]
@@ -87,9 +87,9 @@ def bundle_of(mesh_file: Path) -> Path:
     found = next((place for place in places if of_one and (place / DESCRIPTION).is_file()), None)
     if found is None:
         message = (
-            f"{mesh_file}: expected the frames that it was made of, in which markers are looked for, found no "
-            f"{DESCRIPTION} in {places[0]} or {scan} beside a {MESH}. Put the bundle "
-            "there, or say in another way where scans belong"
+            f"{mesh_file}: expected the frames that it was made of, to find markers in, found no "
+            f"{DESCRIPTION} in {places[0]} or {scan} next to a {MESH}. Put the bundle "
+            "there, or give the poses of scans in another way"
         )
         raise BundleError(message)
     return found
@@ -100,12 +100,12 @@ def markers_of(mesh_file: Path, mesh: Mesh, dictionary: str) -> dict[int, Marker
     of each camera, meet the plane of the mesh there. dictionary : OpenCV's name.
 
     Of several frames the corners are the mean, and known no better than in the best: they share the surface. A marker
-    that is twice in a frame, or on which the mesh is no plane, is left out.
+    that is twice in a frame, or on which the mesh is not a plane, is left out.
 
     Raises
     ------
     BundleError
-        There are no frames, or none in white, or no calibration beside them.
+        There are no frames, or none in white, or no calibration next to them.
     CalibrationError
         There is no such dictionary.
     """
@@ -130,7 +130,7 @@ def markers_of(mesh_file: Path, mesh: Mesh, dictionary: str) -> dict[int, Marker
 def markers_in_view(
     image: Pixels, camera: Pinhole, full_scale: float, mesh: Mesh, dictionary: str
 ) -> Iterator[tuple[int, MarkerObservation]]:
-    """The markers of one frame, (H, W), whose pixels clip at `full_scale`; see `markers_of`."""
+    """The markers of one frame, (H, W), with pixels that clip at `full_scale`; see `markers_of`."""
     grey = GreyImage.from_pixels(image, full_scale)
     outlines, numbers = detect_markers(grey.image_8bit, dictionary)
     modules = int(marker_dictionary(dictionary).markerSize) + 2
@@ -144,21 +144,21 @@ def markers_in_view(
         middle, normal, off_mm = plane
         # Of a plane by n points, where these end: of its middle and two tilts, 1 / n each.
         off_mm *= np.sqrt(3 * _ALIKE / len(mine))
-        placed = _placed(grey.level, rough, modules)
-        sigma_px = np.hypot(placed.sigma_px, SIGMA_FLOOR_PX)
+        fitted = _fit_corners(grey.level, rough, modules)
+        sigma_px = np.hypot(fitted.sigma_px, SIGMA_FLOOR_PX)
         if not (sigma_px < MAX_SIGMA_PX).all():  # NaN where a fit failed
             continue
-        ways = pixel_rays(camera, placed.points_px)
+        ways = pixel_rays(camera, fitted.points_px)
         depth = (middle - camera.centre_mm) @ normal / (ways @ normal)
         cosine = np.abs(ways @ normal) / np.linalg.norm(ways, axis=1)
-        # Of three coordinates the rms: pixels move a corner within the plane, farther where it is seen at a slant, and
+        # Of three coordinates the rms: pixels move a corner within the plane, farther at a slant, and
         # the plane's own error along the ray.
         across_mm = sigma_px * depth / camera.matrix[0, 0]
         sigma = np.sqrt((across_mm**2 * (1 + cosine**-2) + (off_mm / cosine) ** 2) / 3)
         yield number, MarkerObservation(camera.centre_mm + depth[:, None] * ways, sigma)
 
 
-def _placed(level: FloatArray, rough: FloatArray, modules: int) -> PointFit:
+def _fit_corners(level: FloatArray, rough: FloatArray, modules: int) -> PointFit:
     """A marker's corners (4, 2), which OpenCV gives clockwise, by a fit to the pixels about each."""
     # Columns: one module along the side that follows a corner, and one along the side before it.
     slope = np.stack([np.roll(rough, -1, axis=0) - rough, np.roll(rough, 1, axis=0) - rough], axis=2) / modules
@@ -178,17 +178,17 @@ def _inside(outline: FloatArray, places: FloatArray) -> NDArray[np.bool_]:
     return np.asarray((left.all(axis=1) | ~left.any(axis=1)) & np.isfinite(places).all(axis=1))
 
 
-def _mean(seen: list[MarkerObservation]) -> MarkerObservation:
-    weight = np.array([each.sigma_mm for each in seen])[..., None] ** -2
-    corners = (weight * [each.corners_mm for each in seen]).sum(axis=0) / weight.sum(axis=0)
-    return MarkerObservation(corners, np.min([each.sigma_mm for each in seen], axis=0))
+def _mean(markers: list[MarkerObservation]) -> MarkerObservation:
+    weight = np.array([each.sigma_mm for each in markers])[..., None] ** -2
+    corners = (weight * [each.corners_mm for each in markers]).sum(axis=0) / weight.sum(axis=0)
+    return MarkerObservation(corners, np.min([each.sigma_mm for each in markers], axis=0))
 
 
 _PANEL = Size(400, 400)
 _FILL = 0.9
 _DISTANCE = 50.0  # half diagonals of the object: what is nearer is drawn at most 2 % larger
 
-# From the model's frame, y down and z away from who looks from the front, into that of a camera: its axes as rows.
+# From the model's frame, y down and z away from a viewer in front, into that of a camera: its axes as rows.
 _SIDES: Mapping[str, tuple[tuple[int, int, int], ...]] = {
     "front": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "right": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
@@ -202,7 +202,7 @@ _SIDES: Mapping[str, tuple[tuple[int, int, int], ...]] = {
 def six_sides_png(mesh: Mesh) -> bytes:
     """The mesh from six sides at one scale, which a bar gives, as PNG. The front is what the first view's camera saw.
 
-    Backs of triangles are red: they are seen through what is open. The mesh has a triangle.
+    Backs of triangles are red: they are visible through open borders. The mesh has a triangle.
     """
     points = mesh.vertices_mm[used_vertices(mesh.faces, len(mesh.vertices_mm))].astype(np.float64)
     low, high = points.min(axis=0), points.max(axis=0)
@@ -229,9 +229,9 @@ def _panel(mesh: Mesh, side: str, middle_mm: FloatArray, distance_mm: float, px_
     return captioned(panel, side, "backs are red" if side == "front" else "")
 
 
-_SURFACE_POINTS = 500  # of a view, at which it is told how well markers put it
+_SURFACE_POINTS = 500  # of a view, for the deviation of its pose by markers
 _START_SIGMAS = 3.0  # of starts by markers, that have to lie within the start's error
-_TOLD_BORDERS = 10  # of the open borders, the longest ones, each by itself
+_LISTED_BORDERS = 10  # of the open borders, the longest ones, each by itself
 
 
 def combine_into(
@@ -248,16 +248,16 @@ def combine_into(
     """Make one model of the meshes of several views, in the frame of the first, and write its files into a folder that
     only its maker knows yet; see `slrig.model_jobs.job`.
 
-    meshes : the mesh.ply of each view, by the view's name, in the order of `poses`. poses : near where they belong; of
-    a turntable, with its axis and angles; of markers, which are looked for in the frames beside each mesh and hold what
-    shape leaves free; or unknown. start_error_mm : how far a surface may be from there. voxel_mm :
-    length of the model's edges; None is 1.25 times that of the views'. planes : in the views' frame, what lies behind
-    them is cut away first. notes : for the report.
+    meshes : the mesh.ply of each view, by the view's name, in the order of `poses`. poses : near their final ones; of a
+    turntable, with its axis and angles; of markers, which are found in the frames next to each mesh and fix motions
+    that shape leaves free; or unknown. start_error_mm : how far a surface may be from there. voxel_mm : length of the
+    model's edges; None is 1.25 times that of the views'. planes : in the views' frame, what lies behind them is cut
+    away first. notes : for the report.
 
     Raises
     ------
     ConfigError
-        The turntable's axis or angles are not told.
+        The turntable's axis or angles are not given.
     RegistrationRefusedError
         A view overlaps no other, or does not agree with them; poses were to be found, and none or two were; or views
         share too few markers.
@@ -266,9 +266,9 @@ def combine_into(
     TurntableRefusedError
         All but nothing of a view would be left before the planes.
     InvalidInputError
-        A mesh is not as slrig wrote it, is no manifold, or the voxels are too fine for it.
+        A mesh is not as slrig wrote it, is not a manifold, or the voxels are too fine for it.
     NothingToReconstructError
-        No view has a triangle, or the voxels are larger than what was seen.
+        No view has a triangle, or the voxels are larger than the surface.
     ScanCancelledError
         The listener had it cancelled.
     StorageError
@@ -286,18 +286,18 @@ def combine_into(
         listener.report(*at, f"preparing kernels, first time only: {kernel}")
 
     with report_compilations(compiling):
-        names, views, removed, seen = list(meshes), [], [], list[MarkerObservations]()
+        names, views, removed, markers = list(meshes), [], [], list[MarkerObservations]()
         for number, (name, file) in enumerate(meshes.items()):
             entered("reading", 0.2 * number / len(meshes), name)
             mesh = read_mesh(file)
             if isinstance(poses, MarkerPoses):
                 # Before the cut: they lie on the plate.
-                seen.append(markers_of(file, mesh, poses.dictionary))
+                markers.append(markers_of(file, mesh, poses.dictionary))
             view, taken = cut_view(mesh, planes, name=name)
             views.append(view)
             removed.append(taken)
         entered("registering", 0.2, f"{len(views)} views")
-        marked = _marked(views, seen, names, start_error_mm) if isinstance(poses, MarkerPoses) else None
+        marked = _marked(views, markers, names, start_error_mm) if isinstance(poses, MarkerPoses) else None
 
         def again(rounds: int) -> None:
             entered("registering", 0.2 + 0.02 * rounds, f"{len(views)} views, round {rounds + 1}")
@@ -311,11 +311,11 @@ def combine_into(
             dict(zip(names, found.poses, strict=True)), None if axis is None else (axis.point_mm, axis.direction)
         )
         report = _report(names, views, found, None if axis is None else _axis(axis, poses), whole)
-        for view_told, taken in zip(report["views"], removed, strict=True):
-            view_told["removed"] = [
+        for shown, taken in zip(report["views"], removed, strict=True):
+            shown["removed"] = [
                 {"kind": plane.kind, "share": share} for plane, share in zip(planes, taken, strict=True)
             ]
-        report["markers"] = None if marked is None else _of_markers(marked, seen, names)
+        report["markers"] = None if marked is None else _of_markers(marked, markers, names)
         report["notes"] = list(notes)
         # One at a time: each is as large as all meshes.
         files: dict[str, Callable[[], bytes | bytearray]] = {
@@ -344,13 +344,13 @@ def read_mesh(file: Path) -> Mesh:
 
 
 def _marked(
-    views: Sequence[Mesh], seen: Sequence[MarkerObservations], names: Sequence[str], start_error_mm: float
+    views: Sequence[Mesh], markers: Sequence[MarkerObservations], names: Sequence[str], start_error_mm: float
 ) -> MarkerFit:
-    """Where markers put the views. Raises RegistrationRefusedError."""
+    """Poses of the views by markers. Raises RegistrationRefusedError."""
     surfaces = [
         view.vertices_mm[:: max(1, len(view.vertices_mm) // _SURFACE_POINTS)].astype(np.float64) for view in views
     ]
-    return marker_poses(seen, surfaces, names=names, max_sigma_mm=start_error_mm / _START_SIGMAS)
+    return marker_poses(markers, surfaces, names=names, max_sigma_mm=start_error_mm / _START_SIGMAS)
 
 
 def _registered(
@@ -361,7 +361,7 @@ def _registered(
     start_error_mm: float,
     begun: Callable[[int], None],
 ) -> tuple[Registration, TurntableAxis | None]:
-    """Where the views belong, and of a turntable the axis that they tell. Raises ConfigError; as `register_views`."""
+    """Poses of the views, and of a turntable the axis by them. Raises ConfigError; as `register_views`."""
     if marked is not None:
         found = register_views(
             views, marked.poses, names=names, start_error_mm=start_error_mm, start_covariance=marked.covariance
@@ -406,14 +406,14 @@ def _report(
     }
 
 
-def _of_markers(found: MarkerFit, seen: Sequence[MarkerObservations], names: Sequence[str]) -> list[dict[str, Any]]:
-    """What report.json says of each view's markers: those seen, those of them that another view shares, how well they
-    put its surface, and what was left out.
+def _of_markers(found: MarkerFit, markers: Sequence[MarkerObservations], names: Sequence[str]) -> list[dict[str, Any]]:
+    """Each view's markers for report.json: all, those that another view shares, the deviation of the surface by them,
+    and those left out.
     """
     return [
         {
             "view": name,
-            "seen": sorted(seen[v]),
+            "seen": sorted(markers[v]),
             "used": found.used[v],
             "sigma_mm": float(found.sigma_mm[v]),
             "rms_over_sigma": float(found.rms_over_sigma[v]),
@@ -427,20 +427,18 @@ def _of_markers(found: MarkerFit, seen: Sequence[MarkerObservations], names: Seq
     ]
 
 
-def _axis(found: TurntableAxis, told: StartingPoses) -> dict[str, Any]:
-    """The axis as the views have it. turntable_error_deg : (N,), angles as found less those told, within half a
-    turn.
-    """
-    stated_deg = np.array(told.angles_deg if isinstance(told, TurntablePoses) else ())
+def _axis(found: TurntableAxis, stated: StartingPoses) -> dict[str, Any]:
+    """The axis by the views. turntable_error_deg : (N,), angles found less those stated, within half a turn."""
+    stated_deg = np.array(stated.angles_deg if isinstance(stated, TurntablePoses) else ())
     off_deg = np.rad2deg(found.angles_rad) - (stated_deg - stated_deg[0])
     return {**asdict(found), "turntable_error_deg": (off_deg + 180) % 360 - 180}
 
 
 def _of_model(whole: FusedModel) -> dict[str, Any]:
-    """What report.json says of the fused mesh.
+    """The fused mesh for report.json.
 
-    sigma_ends_mm : 5 % and 95 % of its vertices are below. seen_by : share of them by how many views tell of each.
-    open : its borders, of holes and of what no view has seen, see `slrig.meshing.topology`. marked : vertices whose
+    sigma_ends_mm : 5 % and 95 % of its vertices are below. seen_by : share of them by the number of their views. open :
+    its borders, of holes and of parts that no view shows, see `slrig.meshing.topology`. marked : vertices whose
     colour is in doubt, by cause.
     """
     mesh = whole.mesh
@@ -465,7 +463,7 @@ def _of_model(whole: FusedModel) -> dict[str, Any]:
             "largest": [
                 {"length_mm": length, "area_mm2": area}
                 for length, area in zip(borders.length_mm.tolist(), borders.area_mm2.tolist(), strict=True)
-            ][:_TOLD_BORDERS],
+            ][:_LISTED_BORDERS],
         },
         "marked_vertices": {mark.name.lower(): int(marked[mark]) for mark in AlbedoMark if mark is not AlbedoMark.NONE},
     }

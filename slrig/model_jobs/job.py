@@ -53,7 +53,7 @@ from slrig.scan.job import plan_from_json as scan_plan_from_json
 
 
 def summary(model: Path) -> dict[str, Any]:
-    """What a list says of a model, of the report in its folder. sigma_mm : of its vertices, the middle one.
+    """A model's entry in a list, of the report in its folder. sigma_mm : of its vertices, the middle one.
 
     pose_sigma_mm : of the view that is known least. free : views that may move without a residual. notes : if there are
     any. Raises StorageError.
@@ -82,7 +82,7 @@ def found_axis(model: Path) -> MeasuredAxis | None:
 
 @contextmanager
 def _report(model: Path) -> Iterator[dict[str, Any]]:
-    """A model's report. Raises StorageError: it cannot be read, or lacks what is looked for within the block."""
+    """A model's report. Raises StorageError: it cannot be read, or lacks a key that is read within the block."""
     try:
         yield stored_json((model / REPORT).read_bytes())
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -143,7 +143,7 @@ class ModelJob(Job):
         for scan, mesh in meshes.items():
             if not mesh.exists() or mesh.resolve() != (data / SCANS).resolve() / scan / MESH:
                 raise _mesh_gone(mesh, scan)
-            require_whole(mesh.parent, MESH, remedy=f"POST /scan/{scan}/reconstruct makes it anew.")
+            require_whole(mesh.parent, MESH, remedy=f"POST /scan/{scan}/reconstruct makes it again.")
         combining.combine_into(
             meshes,
             run.folder,
@@ -190,17 +190,17 @@ class Models:
         self._data = manager.data
         self._turntable = turntable
         self._spare_bytes = spare_bytes
-        # Held while scans are looked up and named by a job, and while one is deleted.
+        # Held while scans are read and named by a job, and while one is deleted.
         self._naming = threading.Lock()
         (self._data.root / MODELS).mkdir(exist_ok=True)
         manager.groups[JobKind.MODEL] = self
 
     def place(self, model_id: UUID) -> Path:
-        """Where the files of a model lie."""
+        """Folder of a model's files."""
         return self._data.root / MODELS / str(model_id)
 
     def combine(self, plan: ModelPlan, *, label: str | None = None, key: str | None = None) -> JobRecord:
-        """Have a model made. Returns at once. key : the idempotency key of the request, reserved.
+        """Make a model. Returns at once. key : the idempotency key of the request, reserved.
 
         Raises
         ------
@@ -218,7 +218,7 @@ class Models:
         """
         with self._naming:
             used = self.settled(plan)
-            # Those that are shot have their own line, and may wait for a hand.
+            # Those that are shot have their own line, and may wait for a person.
             unfinished = self.jobs.unfinished(JobKind.MODEL)
             waiting = [each for each in unfinished if not plan_from_json(each.plan).being_shot]
             most = self._manager.backlog_length
@@ -228,7 +228,7 @@ class Models:
         return self.jobs.get(record.id)
 
     def begin(self, record: JobRecord, plan: ModelPlan) -> None:
-        """Have a model on record made, now that its views were shot: `plan` names them. Raises as `combine`."""
+        """Make a model on record, now that its views were shot: `plan` names them. Raises as `combine`."""
         with self._naming:
             used = self.settled(plan)
             self._require_space(used)
@@ -266,26 +266,26 @@ class Models:
             without = [str(each) for each in plan.scans if not (self._data.scan(each) / BUNDLE).is_dir()]
             if without:
                 message = (
-                    "poses: expected the frames of each scan, in which markers are looked for, found none of "
+                    "poses: expected the frames of each scan, to find markers in, found none of "
                     f"{', '.join(without)}; leave those out, or give the poses in another way"
                 )
                 raise ConfigError(message)
         if not isinstance(poses, TurntablePoses):
             return plan
         if poses.angles_deg is None:
-            told = {scan: self._angle_told(scan) for scan in plan.scans}
-            untold = [str(scan) for scan, turntable in told.items() if turntable is None]
-            if untold:
+            recorded = {scan: self._recorded_angle(scan) for scan in plan.scans}
+            without = [str(scan) for scan, turntable in recorded.items() if turntable is None]
+            if without:
                 message = (
                     "angles_deg: expected the turntable's angle in the report of each scan, found none in "
-                    f"{', '.join(untold)}; say angles_deg, one for each scan in their order, or give the poses"
+                    f"{', '.join(without)}; give angles_deg, one for each scan in their order, or give the poses"
                 )
                 raise ConfigError(message)
-            turntables = [turntable for turntable in told.values() if turntable is not None]
+            turntables = [turntable for turntable in recorded.values() if turntable is not None]
             if len({count for _, count in turntables}) > 1:
                 message = (
                     "angles_deg: expected angles with one zero, and the turntable lost its place between these scans; "
-                    'say angles_deg as they are, "poses": "unknown", or shoot them again'
+                    'give angles_deg as they are, "poses": "unknown", or shoot them again'
                 )
                 raise ConfigError(message)
             poses = replace(poses, angles_deg=tuple(angle_deg for angle_deg, _ in turntables))
@@ -331,7 +331,7 @@ class Models:
                 axis = found_axis(self.place(job_id)) if known.isdisjoint(scans) else None
                 if axis is not None:
                     self._turntable.note(axis, of=str(job_id))
-            except Exception:  # noqa: BLE001 - the model is there, and is no worse for that
+            except Exception:  # noqa: BLE001 - the model is there, and is complete without it
                 _log.exception("the axis of a model could not be noted", model=str(job_id))
         return outcome
 
@@ -345,10 +345,8 @@ class Models:
             raise _mesh_gone(mesh, str(scan_id))
         return mesh
 
-    def _angle_told(self, scan_id: UUID) -> tuple[float, str | None] | None:
-        """Where the turntable stood, deg, and what that counts from, as a scan's report says; None where it does
-        not.
-        """
+    def _recorded_angle(self, scan_id: UUID) -> tuple[float, str | None] | None:
+        """Angle of the turntable, deg, and the id of its zero, by a scan's report; None where it has none."""
         try:
             return turntable_angle(self._data.read(self._data.scan(scan_id) / "report.json"))
         except FileNotFoundError:
@@ -356,10 +354,10 @@ class Models:
 
 
 MOST_AGAIN = 2
-"""How often a view is shot again by itself: what a device does three times it will do once more."""
+"""Most automatic repeats of a view: a device that fails three times will fail again."""
 
 VIEW, TURN = "view", "turn"
-"""Stages of a model's progress: a view is shot, or the object is to be turned by hand."""
+"""Stages of a model's progress: a view is shot, or the object is to be turned manually."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -389,13 +387,13 @@ class View:
 
     @property
     def count(self) -> str | None:
-        """What the turntable's angle of its good scan counts from; None where that is not kept, as by hand."""
+        """Id of the zero of the turntable's angle of its good scan; None without one, as where a person turns."""
         found = None if self.good is None else (self.good.summary or {}).get("turntable", {}).get("count")
         return None if found is None else str(found)
 
     @property
     def again(self) -> bool:
-        """Whether it is to be shot again by itself: a device failed, or the service was ended."""
+        """Whether it is repeated automatically: a device failed, or the service was ended."""
         failed = 0
         for scan in reversed(self.scans):
             if not _may_pass(scan):
@@ -420,7 +418,7 @@ class ViewShooting:
         self._models = models
         self._manager = manager
         self._jobs = manager.store
-        # Held while it is decided what comes next; the end of a scan may be told within.
+        # Held while the next step is decided; the end of a scan may be reported within.
         self._deciding = threading.RLock()
 
     def take_up(self) -> None:
@@ -439,15 +437,15 @@ class ViewShooting:
                 self._manager.cancel(scan.id)
 
     def shoot(self, plan: ModelPlan, *, label: str | None, wait: bool, key: str | None = None) -> JobRecord:
-        """Have the views of a model shot, and the model made of them. Returns at once.
+        """Shoot the views of a model, and make the model of them. Returns at once.
 
-        By hand only the first view is shot, as the object stands; `shoot_view` shoots each of the others. wait : stand
-        in line while the rig is held. key : the idempotency key of the request, reserved.
+        Where a person turns only the first view is shot; `shoot_view` shoots each of the others. wait : wait in line
+        while the rig is held. key : the idempotency key of the request, reserved.
 
         Raises
         ------
         UnsupportedByDeviceError
-            The rig has no turntable, and nobody turns the object by hand; or it cannot do what the scans ask for.
+            The rig has no turntable, and the plan is not `manual`; or it cannot do the requested scans.
         ConfigError
             The poses are to be a turntable's, and its axis is not known.
         PatternError, CalibrationError, StorageError, RigBusyError, QueueFullError, DeviceError
@@ -470,20 +468,20 @@ class ViewShooting:
                 with suppress(JobNotFoundError, StorageError):
                     self._jobs.finish(model_id, JobState.FAILED, fault=job_failure(error))
                 raise
-            self._tell(model_id, shoot)
+            self._record_progress(model_id, shoot)
         self._watch(model_id)
         return self._jobs.get(model_id, JobKind.MODEL)
 
     def shoot_view(self, model_id: UUID, *, again: bool, wait: bool, key: str | None = None) -> JobRecord:
-        """Have the next view of a model shot, whose object was turned by hand; or the last one once more, in place of
-        what there is of it. Returns the model at once.
+        """Shoot the next view of a model of a manually turned object; or the last one again, which replaces it. Returns
+        the model at once.
 
         Raises
         ------
         JobNotFoundError
             There is no such model.
         ScanStateError
-            It waits for no hand, or has no further view.
+            It does not wait for a person, or has no further view.
         PatternError, CalibrationError, StorageError, RigBusyError, QueueFullError, DeviceError
             As a scan.
         """
@@ -499,18 +497,18 @@ class ViewShooting:
                 raise ScanStateError(message)
             plan = shoot.view(number, model_id, utc_now())
             self._manager.submit(ScanJob(plan), label=record.label, wait=wait, key=key)
-            self._tell(model_id, shoot)
+            self._record_progress(model_id, shoot)
             return self._jobs.get(model_id, JobKind.MODEL)
 
     def combine(self, model_id: UUID) -> JobRecord:
-        """Have a model made of the views that there are. Returns it at once.
+        """Make a model of the present views. Returns it at once.
 
         Raises
         ------
         JobNotFoundError
             There is no such model.
         ScanStateError
-            It waits for no hand, or fewer than two of its views are good.
+            It does not wait for a person, or fewer than two of its views are good.
         """
         with self._deciding:
             record, shoot, views = self._waiting(model_id)
@@ -522,8 +520,8 @@ class ViewShooting:
             return self._jobs.get(model_id, JobKind.MODEL)
 
     def cancel(self, model_id: UUID) -> JobRecord:
-        """Ask a model to end early, and with it those of its scans that are not over. Returns at once; one that is over
-        stays so. Raises JobNotFoundError.
+        """Request the early end of a model and of its scans that are not over. Returns at once; one that is over stays
+        so. Raises JobNotFoundError.
         """
         with self._deciding:
             record = self._jobs.get(model_id, JobKind.MODEL)
@@ -547,7 +545,7 @@ class ViewShooting:
             _log.exception("a model could not be gone on with", model=str(scan.parent))
 
     def _go_on(self, model_id: UUID) -> None:
-        """Do what comes next, whatever was done before: shoot what is missing, tell a person, or make the model."""
+        """Take the next step: shoot a missing view, prompt the person, or make the model."""
         with self._deciding:
             try:
                 record = self._jobs.get(model_id, JobKind.MODEL)
@@ -560,7 +558,7 @@ class ViewShooting:
             shoot = _shoot_plan(plan)
             views = self._views(model_id, shoot)
             if shoot.manual:
-                # The object stands as for the last that was begun; the first one needs no hand.
+                # The object is turned as for the last view that was begun; the first one needs no turn.
                 begun = [view for view in views if view.scans] or [views[0]]
                 missing = [view for view in begun[-1:] if view.again or not view.scans]
             else:
@@ -577,10 +575,10 @@ class ViewShooting:
             elif all(view.ended or shoot.manual for view in views):
                 self._combine(record, shoot, views)
                 return
-            self._tell(model_id, shoot)
+            self._record_progress(model_id, shoot)
 
     def _combine(self, record: JobRecord, shoot: ShootPlan, views: Sequence[View]) -> None:
-        """Have the model made of its good views, or end it in words."""
+        """Make the model of its good views, or end it with a message."""
         plan = plan_from_json(record.plan)
         lost = {view.number for view in _of_another_zero(plan, views)}
         good = {view.number: view.good.id for view in views if view.good is not None and view.number not in lost}
@@ -612,11 +610,11 @@ class ViewShooting:
         self._manager.require_space(sum(view.check(self._manager.rig) for view in views))
 
     def _waiting(self, model_id: UUID) -> tuple[JobRecord, ShootPlan, tuple[View, ...]]:
-        """A model that waits for a hand. Raises JobNotFoundError, ScanStateError."""
+        """A model that waits for a person. Raises JobNotFoundError, ScanStateError."""
         record = self._jobs.get(model_id, JobKind.MODEL)
         plan = plan_from_json(record.plan)
         if record.state.final or not plan.being_shot or plan.shoot is None or not plan.shoot.manual:
-            how = "is not shot by hand" if plan.shoot is None or not plan.shoot.manual else f"is {record.state}"
+            how = "is not shot manually" if plan.shoot is None or not plan.shoot.manual else f"is {record.state}"
             message = f'Model {model_id} {how}. Begin one: POST /model/shoot with "manual": true.'
             raise ScanStateError(message)
         views = self._views(model_id, plan.shoot)
@@ -631,8 +629,8 @@ class ViewShooting:
     def _views(self, model_id: UUID, shoot: ShootPlan) -> tuple[View, ...]:
         return views_of(shoot, self._jobs.of(model_id))
 
-    def _tell(self, model_id: UUID, shoot: ShootPlan) -> None:
-        """Put on record how far it is, and for a person what to do."""
+    def _record_progress(self, model_id: UUID, shoot: ShootPlan) -> None:
+        """Record its progress, and for a person the next step."""
         views = self._views(model_id, shoot)
         done = sum(view.good is not None for view in views)
         under_way = next((view for view in views if view.scans and not view.ended), None)
@@ -650,23 +648,23 @@ class ViewShooting:
         try:
             self._jobs.progress(model_id, JobProgress(stage, SHOOTING_SHARE * done / shoot.views, detail))
         except StorageError as error:
-            _log.warning("how far a model is could not be recorded", model=str(model_id), cause=str(error))
+            _log.warning("the progress of a model could not be recorded", model=str(model_id), cause=str(error))
 
     def _watch(self, model_id: UUID) -> None:
-        """Have a model that is queued be on record as capturing once the first of its views is begun."""
+        """Record a queued model as capturing once the first of its views is begun."""
 
-        def look() -> None:
-            # The next event will do where this one comes in the middle of a decision: whoever tells it may hold a lock.
+        def check() -> None:
+            # During a decision the next event will do: the thread of this one may hold a lock.
             if not self._deciding.acquire(blocking=False):
                 return
             try:
-                look_at_states()
+                check_states()
             except StorageError as error:
-                _log.warning("that a model is shot could not be recorded", model=str(model_id), cause=str(error))
+                _log.warning("the first view of a model could not be recorded", model=str(model_id), cause=str(error))
             finally:
                 self._deciding.release()
 
-        def look_at_states() -> None:
+        def check_states() -> None:
             begun = any(scan.state is not JobState.QUEUED for scan in self._jobs.of(model_id))
             if begun and watching:
                 watching.pop()()
@@ -674,8 +672,8 @@ class ViewShooting:
                     self._jobs.advance(model_id, JobState.CAPTURING)
 
         watching: list[Callable[[], None]] = []
-        watching.append(self._jobs.watch(model_id, look))
-        look()
+        watching.append(self._jobs.watch(model_id, check))
+        check()
 
 
 def _shoot_plan(plan: ModelPlan) -> ShootPlan:
@@ -686,8 +684,8 @@ def _shoot_plan(plan: ModelPlan) -> ShootPlan:
 
 
 def _of_another_zero(plan: ModelPlan, views: Sequence[View]) -> list[View]:
-    """Good views whose angles count from another zero than those of the newest one: the turntable, or the service in
-    the middle of a turn, was restarted in between. None where no angle is used.
+    """Good views with angles from another zero than those of the newest one: the turntable, or the service in the
+    middle of a turn, was restarted in between. None where no angle is used.
     """
     good = [view for view in views if view.good is not None]
     if isinstance(plan.poses, UnknownPoses | MarkerPoses) or not good:
@@ -697,7 +695,7 @@ def _of_another_zero(plan: ModelPlan, views: Sequence[View]) -> list[View]:
 
 
 def _may_pass(scan: JobRecord) -> bool:
-    """Whether a scan failed by what may be over the next time: a device's fault, or the end of the service."""
+    """Whether a scan failed by a passing cause: a device's fault, or the end of the service."""
     if scan.state is JobState.INTERRUPTED:
         return True
     error = SlrigError if scan.fault is None else errors_by_code().get(scan.fault.code, SlrigError)

@@ -1,4 +1,4 @@
-"""What a model of several scans is asked to do: frozen data, and its JSON."""
+"""The plan of a model of several scans: frozen data, and its JSON."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ START_ERROR_MM = 3.0
 """See `slrig.multiview.registration.START_ERROR_MM`, which is not loaded where nothing is computed."""
 
 MOST_UNKNOWN = 24
-"""Views whose poses are to be found: eight take 15 to 20 s, and the time grows with their square."""
+"""Most views with poses to be found: eight take 15 to 20 s, and the time grows with their square."""
 
 MARKER_DICTIONARY = "DICT_5X5_250"
 """That of the boards, see `slrig.calibration.board.DEFAULT_DICTIONARY`."""
 
 MOST_VIEWS = 72
-"""Of a model that is shot: one every 5°, closer than which neighbours tell the same."""
+"""Most views of a model that is shot: one every 5°; closer neighbours show the same."""
 
 Vector = tuple[float, float, float]
 Row = tuple[float, float, float, float]
@@ -70,7 +70,7 @@ class TurntablePoses:
 
 @dataclass(frozen=True, slots=True)
 class GivenPoses:
-    """Somebody knows about where the scans belong. matrices : of each scan one that takes its mm to a common frame."""
+    """Approximate poses of the scans are known. matrices : of each scan one that takes its mm to a common frame."""
 
     matrices: tuple[Matrix, ...]
     kind: Literal["given"] = "given"
@@ -83,14 +83,14 @@ class GivenPoses:
 
 @dataclass(frozen=True, slots=True)
 class UnknownPoses:
-    """Nobody knows where the scans belong: it is found from what they see, or refused. At most MOST_UNKNOWN."""
+    """The poses of the scans are found from their surfaces, or refused. At most MOST_UNKNOWN."""
 
     kind: Literal["unknown"] = "unknown"
 
 
 @dataclass(frozen=True, slots=True)
 class MarkerPoses:
-    """Markers that turn with the object tell where the scans belong. dictionary : OpenCV's name for theirs."""
+    """The poses of the scans are found by markers that turn with the object. dictionary : OpenCV's name for theirs."""
 
     dictionary: str = MARKER_DICTIONARY
     kind: Literal["markers"] = "markers"
@@ -100,7 +100,7 @@ StartingPoses = TurntablePoses | GivenPoses | UnknownPoses | MarkerPoses
 
 
 def turntable_angle(report: bytes) -> tuple[float, str | None] | None:
-    """Where the turntable stood, deg, and what that counts from, as a scan's report says; None where it does not."""
+    """Angle of the turntable, deg, and the id of its zero, by a scan's report; None where it has none."""
     try:
         turntable = stored_json(report)["turntable"]
         return float(turntable["angle_deg"]), turntable.get("count")
@@ -110,7 +110,7 @@ def turntable_angle(report: bytes) -> tuple[float, str | None] | None:
 
 @dataclass(frozen=True, slots=True)
 class ShootPlan:
-    """What is shot for a model: so many views, evenly around a turntable. scan : each of them, but for its angle.
+    """Views to shoot for a model, evenly around a turntable. scan : each of them, except its angle.
     manual : a person turns the object, and says when.
 
     Raises ConfigError: there are fewer than two views, or more than MOST_VIEWS.
@@ -131,7 +131,7 @@ class ShootPlan:
         return 360 / self.views
 
     def angle_deg(self, number: int) -> float:
-        """Where the turntable stands for a view, counted from 1."""
+        """Angle of the turntable for a view, counted from 1."""
         return (number - 1) * self.step_deg
 
     def view(self, number: int, model_id: UUID, begins_at: datetime) -> ScanPlan:
@@ -148,7 +148,7 @@ class ModelPlan:
     start_error_mm : how far a surface may be from where `poses` put it. voxel_mm : length of the model's edges; None is
     1.25 times that of the scans'. cut : whether what lies behind the planes of the turntable, where there are any, is
     cut away first. shoot : what is shot for it, None of scans that there were; until that has ended
-    there are no `scans`, and poses that are given are of all views. notes : for the report, in sentences.
+    there are no `scans`, and given poses are of all views. notes : for the report, in sentences.
 
     Raises
     ------
@@ -176,18 +176,18 @@ class ModelPlan:
         count = self.shoot.views if self.shoot is not None and self.being_shot else len(self.scans)
         if isinstance(self.poses, UnknownPoses) and count > MOST_UNKNOWN:
             message = (
-                f"poses: expected at most {MOST_UNKNOWN} views whose poses nobody knows, found {count}; each is held "
-                "against all others. Say poses, or a turntable's axis and angles, or take fewer"
+                f"poses: expected at most {MOST_UNKNOWN} views with unknown poses, found {count}; each is compared "
+                "with all others. Give poses, or a turntable's axis and angles, or take fewer"
             )
             raise ConfigError(message)
         name = "poses" if isinstance(self.poses, GivenPoses) else "angles_deg"
-        told: Sequence[object] | None = None
+        given: Sequence[object] | None = None
         if isinstance(self.poses, GivenPoses):
-            told = self.poses.matrices
+            given = self.poses.matrices
         elif isinstance(self.poses, TurntablePoses):
-            told = self.poses.angles_deg
-        if told is not None and len(told) != count:
-            message = f"{name}: expected one for each of {count} scans, in their order, found {len(told)}"
+            given = self.poses.angles_deg
+        if given is not None and len(given) != count:
+            message = f"{name}: expected one for each of {count} scans, in their order, found {len(given)}"
             raise ConfigError(message)
         for name, length_mm in (("start_error_mm", self.start_error_mm), ("voxel_mm", self.voxel_mm)):
             if length_mm is not None and not 0 < length_mm < math.inf:
@@ -235,8 +235,8 @@ MEDIA_TYPES: Mapping[str, str] = {
     COARSE: "model/gltf-binary",
     REPORT: "application/json",
 }
-"""What every model has that succeeded."""
+"""Media types of the files of every model that succeeded."""
 
 
 REPORT_FORMAT = "slrig-model"
-"""Of its report, which is not that of a scan: a model never takes the place of one."""
+"""Format of its report, which is not that of a scan: a model never replaces one."""

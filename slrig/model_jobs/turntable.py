@@ -73,7 +73,7 @@ def state_of(record: TurntableRecord, own: RotationAxis | None) -> tuple[Turntab
     """
     if record.axis is None and own is None:
         return TurntableState.UNKNOWN, (
-            "stand a board on the turntable and have it shot at six angles (POST /rig/turntable/shoot)"
+            "put a board on the turntable and shoot it at six angles (POST /rig/turntable/shoot)"
         )
     if record.history and not record.history[-1].taken:
         last = record.history[-1]
@@ -100,7 +100,7 @@ class TurntableStore:
     """The turntable of a data folder. One process uses it, from any thread. root : its own folder in there,
     DATA/turntable.
 
-    Whatever reads or writes raises StorageError: the disk refused, or the file is damaged. A damaged one is never
+    All methods raise StorageError: the disk refused, or the file is damaged. A damaged one is never
     overwritten: it has to be deleted first.
     """
 
@@ -109,7 +109,7 @@ class TurntableStore:
         self._lock = threading.RLock()
 
     def record(self) -> TurntableRecord:
-        """What is known; nothing where there is no file."""
+        """The record; an empty one where there is no file."""
         if not self._path.exists():
             return TurntableRecord()
         try:
@@ -157,7 +157,7 @@ class TurntableStore:
     def note(self, axis: MeasuredAxis, *, of: str, at: datetime | None = None) -> AxisUpdate | None:
         """Improve the axis on record by one that a model was found to turn about; None where none is on record.
 
-        An axis that is too far from it (`MOST_SIGMAS`) is not taken, only told.
+        An axis that is too far from it (`MOST_SIGMAS`) is not taken, only reported.
         """
         with self._lock:
             record = self.record()
@@ -209,7 +209,7 @@ _COLOURS = {AxisSource.BOARD: GREY, AxisSource.DOCUMENT: GREY, AxisSource.MODEL:
 
 
 def turntable_svg(history: Sequence[ChangeEntry], /) -> Markup:
-    """The picture of all axes that were found, from old to new. With none it says so in words."""
+    """The picture of all axes that were found, from old to new. With none it says so."""
     if not history:
         return nothing_yet("No axis was found yet. POST /rig/turntable/axis calibrates one.")
     moments = [each.at for each in history]
@@ -221,11 +221,11 @@ def turntable_svg(history: Sequence[ChangeEntry], /) -> Markup:
         history, f"From the first axis, up to {AXIS_SPAN_MM:g} mm along it, mm", TOP, [mm for mm, _ in apart], ends
     )
     parts += _panel(history, "Its direction from the first one's, °", second, [deg for _, deg in apart], turns)
-    for number, (colour, words) in enumerate(((GREY, "board"), (GREEN, "model"), (ORANGE, "not taken"))):
+    for number, (colour, label) in enumerate(((GREY, "board"), (GREEN, "model"), (ORANGE, "not taken"))):
         x = END - 190 + 64 * number
-        parts += [shape("circle", cx=x, cy=TOP - 16, r=3.2, fill=colour), shape("text", words, x=x + 8, y=TOP - 12)]
-    words = f"the axis of the turntable as it was found {len(history)} times, now {apart[-1][0]:.3g} mm from the first"
-    return trend(words, _HEIGHT, [*parts, *times(moments, second + PANEL)])
+        parts += [shape("circle", cx=x, cy=TOP - 16, r=3.2, fill=colour), shape("text", label, x=x + 8, y=TOP - 12)]
+    title = f"the axis of the turntable as it was found {len(history)} times, now {apart[-1][0]:.3g} mm from the first"
+    return trend(title, _HEIGHT, [*parts, *times(moments, second + PANEL)])
 
 
 def _panel(
@@ -237,14 +237,14 @@ def _panel(
     panel.line(taken, PALE, of=[""] * len(taken))
     for each, value, sigma in zip(history, values, sigmas, strict=True):
         colour = _COLOURS[each.source] if each.taken else ORANGE
-        words = f"{each.source} {each.of}: {value:.4g} ± {sigma:.2g}" + ("" if each.taken else ", not taken")
+        text = f"{each.source} {each.of}: {value:.4g} ± {sigma:.2g}" + ("" if each.taken else ", not taken")
         panel.bar(each.at, value, sigma, colour)
-        panel.dot(each.at, value, colour, words)
+        panel.dot(each.at, value, colour, text)
     return panel.parts
 
 
 def _apart(first: ChangeEntry, later: ChangeEntry) -> tuple[float, float]:
-    """How far two axes are apart at most, mm, up to 50 mm either way of the later one's point, and their angle, °."""
+    """Largest distance of two axes, mm, up to 50 mm either way of the later one's point, and their angle, °."""
     way, other = np.array(first.direction), np.array(later.direction)
     ends = [np.array(later.point_mm) + s * other - np.array(first.point_mm) for s in (-AXIS_SPAN_MM, AXIS_SPAN_MM)]
     sine = min(float(np.linalg.norm(np.cross(way, other))), 1.0)

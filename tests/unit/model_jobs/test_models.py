@@ -349,7 +349,7 @@ def test_last_view_that_ends_before_its_progress_is_recorded_is_no_first_one(
     assert shoot is not None
     told: list[JobProgress] = []
     monkeypatch.setattr(shooting.store, "progress", lambda _, progress: told.append(progress))
-    shooting.shooting._tell(model_id, shoot)
+    shooting.shooting._record_progress(model_id, shoot)
     assert [each.detail for each in told] == ["view 4 of 4"]
 
 
@@ -389,9 +389,9 @@ def test_a_cancelled_model_takes_its_waiting_views_with_it(shooting: ShootingBen
     shooting.gate.clear()
     model_id = started(shooting)
     assert shooting.began.wait(WAIT_S)
-    with pytest.raises(ScanStateError, match="is not shot by hand"):
+    with pytest.raises(ScanStateError, match="is not shot manually"):
         shooting.shooting.combine(model_id)
-    with pytest.raises(ScanStateError, match="is not shot by hand"):
+    with pytest.raises(ScanStateError, match="is not shot manually"):
         shooting.shooting.shoot_view(model_id, again=True, wait=True)
     with (
         pytest.raises(ScanStateError, match=f"needed by model {model_id}"),
