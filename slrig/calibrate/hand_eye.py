@@ -1,4 +1,4 @@
-"""Hand-eye calibration from bundles or scans: what the rig saw, hand_eye.json, and the check against drift."""
+"""Hand-eye calibration from bundles or scans: the rig's observations, hand_eye.json, and the check against drift."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 HAND_EYE = "hand_eye.json"
 _MAX_BYTES = 2**22
 _INDEPENDENT_POINTS = 100
-"""Points of a sphere whose errors are taken to be independent: those of neighbours in a scan are alike."""
+"""Independent errors among the points of a sphere, as assumed: those of neighbours in a scan are alike."""
 _MAX_POSES = 300
 
 
 def _check_covariance(rows: list[list[float]]) -> list[list[float]]:
     square = all(len(row) == len(rows) for row in rows)
     matrix = np.array(rows) if square else np.zeros((0, 0))
-    # Turns are small numbers beside shifts.
+    # Turns are small numbers compared with shifts.
     scale = np.sqrt(np.abs(np.diagonal(matrix))) + 1e-300
     if not square or not (np.linalg.eigvalsh(matrix / np.outer(scale, scale)) > -1e-6).all():
         raise ValueError("expected a covariance, square and without negative variances, found another matrix")
@@ -46,7 +46,7 @@ Covariance = Annotated[
 
 
 class PoseResidual(Strict):
-    """Of one pose: how far the target was from where it should have been."""
+    """Residual of one pose: deviation of the target from its expected pose."""
 
     name: str
     residual_mm: float
@@ -54,7 +54,7 @@ class PoseResidual(Strict):
 
 
 class NextPose(Strict):
-    """The pose that would tell most."""
+    """The most informative next pose."""
 
     words: str
     flange: PoseEntry = Field(description="of the flange in the base, mm")
@@ -62,14 +62,14 @@ class NextPose(Strict):
 
 
 class HandEyeDocument(Strict):
-    """hand_eye.json: where the rig is on or before a robot. Matrices take points of one frame to another."""
+    """hand_eye.json: pose of the rig on or before a robot. Matrices take points of one frame to another."""
 
     format: Literal["slrig-hand-eye"] = "slrig-hand-eye"
     version: Literal[1] = 1
-    kind: Literal["in-hand", "fixed"] = Field(description="in-hand: the rig is on the flange. fixed: it stands still")
+    kind: Literal["in-hand", "fixed"] = Field(description="in-hand: the rig is on the flange. fixed: it does not move")
     calibration: str | None = Field(description="the solve of the rig that it belongs to: its frame is the rig's")
     base_frame: FreeText = Field(default="base_link", description="name of the robot's base, for ROS")
-    flange_frame: FreeText = Field(default="tool0", description="name of what the robot's poses are of, for ROS")
+    flange_frame: FreeText = Field(default="tool0", description="name of the frame of the robot's poses, for ROS")
     rig: PoseEntry = Field(description="rig to flange (in-hand) or to base (fixed)")
     covariance: Covariance
     inverse: PoseEntry = Field(description="flange or base to rig")
@@ -95,7 +95,7 @@ class HandEyeDocument(Strict):
         return self
 
     def rig_in_base(self, robot_pose: Sequence[Sequence[float]] | None) -> FloatArray:
-        """(4, 4): rig to base. robot_pose : of the flange in the base, which a rig in hand needs.
+        """(4, 4): rig to base. robot_pose : of the flange in the base, which a rig on the flange needs.
 
         Raises CalibrationError if there is none.
         """
@@ -103,7 +103,7 @@ class HandEyeDocument(Strict):
             return np.array(self.rig)
         if robot_pose is None:
             message = (
-                "the rig is in the robot's hand, and has a place in the robot's frame only where the flange's pose is "
+                "the rig is on the robot's flange, and has a pose in the robot's frame only where the flange's pose is "
                 "known: give robot_pose (4 x 4, flange in base, mm) with the scan"
             )
             raise CalibrationError(message)
@@ -139,7 +139,7 @@ def hand_eye_document(
 
 
 def hand_eye_of(document: HandEyeDocument) -> HandEye:
-    """What a document says, as `check_hand_eye` takes it."""
+    """The result in a document, for `check_hand_eye`."""
     from slrig.calibration.hand_eye import HandEye, HandEyeKind
 
     return HandEye(
@@ -162,21 +162,21 @@ def read_hand_eye(path: Path) -> HandEyeDocument:
 
 
 @dataclass(frozen=True, slots=True)
-class SeenTargets:
-    """What the rig saw, in pairs with the robot's poses. refused : by pose, why it could not be used."""
+class ObservedTargets:
+    """The rig's observations, in pairs with the robot's poses. refused : by pose, why it could not be used."""
 
     robot: RobotPoses
-    seen: TargetPoses
+    observed: TargetPoses
     refused: Mapping[str, str]
 
 
-def seen_boards(
+def observe_boards(
     robot: RobotPoses,
     bundles: Mapping[str, Path],
     board: Board,
     calibration: Calibration,
     report: Callable[[float, str], None],
-) -> SeenTargets:
+) -> ObservedTargets:
     """The board's poses in bundles of the same names.
 
     Raises PoseRefusedError if none can be used; CalibrationError: the calibration is of other cameras.
@@ -187,12 +187,12 @@ def seen_boards(
         return read_pose(bundles[name], board, name).observation
 
     chosen, poses, refused = _each_read(robot, observed, report)
-    return SeenTargets(robot.select(chosen), _posed(poses, board, calibration), refused)
+    return ObservedTargets(robot.select(chosen), _posed(poses, board, calibration), refused)
 
 
-def seen_spheres(
+def observe_spheres(
     robot: RobotPoses, scans: Mapping[str, Path], diameter_mm: float, report: Callable[[float, str], None]
-) -> SeenTargets:
+) -> ObservedTargets:
     """The sphere's centres in scans (folders with a mesh.ply) of the same names. Raises PoseRefusedError."""
     from scipy.linalg import block_diag
 
@@ -212,7 +212,7 @@ def seen_spheres(
     poses = np.tile(np.eye(4), (len(found), 1, 1))
     poses[:, :3, 3] = [place for place, _ in found]
     kept = robot.select(chosen)
-    return SeenTargets(kept, TargetPoses(kept.names, poses, block_diag(*(each for _, each in found))), refused)
+    return ObservedTargets(kept, TargetPoses(kept.names, poses, block_diag(*(each for _, each in found))), refused)
 
 
 def _each_read(
@@ -235,7 +235,7 @@ def _each_read(
     return np.array(chosen, dtype=np.intp), found, refused
 
 
-def paired(robot: RobotPoses, folders: Mapping[str, Path]) -> RobotPoses:
+def pair_poses(robot: RobotPoses, folders: Mapping[str, Path]) -> RobotPoses:
     """The robot's poses by the names of folders that belong to them: in order, if they are numbered, or by their names.
 
     Raises CalibrationError if none or not all belong together.
@@ -294,10 +294,10 @@ class ReadBoards:
     board: Board
     calibration: Calibration
 
-    def targets(self, robot: Sequence[Any]) -> SeenTargets:
+    def targets(self, robot: Sequence[Any]) -> ObservedTargets:
         """The board's poses, in pairs with the robot's. Raises CalibrationError."""
-        seen = _posed(self.observations, self.board, self.calibration)
-        return SeenTargets(_named(seen.names, robot), seen, {})
+        observed = _posed(self.observations, self.board, self.calibration)
+        return ObservedTargets(_named(observed.names, robot), observed, {})
 
 
 @dataclass(frozen=True, slots=True)
@@ -308,9 +308,9 @@ class ScannedSpheres:
     diameter_mm: float
     calibration: Calibration
 
-    def targets(self, robot: Sequence[Any]) -> SeenTargets:
+    def targets(self, robot: Sequence[Any]) -> ObservedTargets:
         """The sphere's centres, in pairs with the robot's poses. Raises PoseRefusedError."""
-        return seen_spheres(_named(tuple(self.scans), robot), self.scans, self.diameter_mm, lambda *_: None)
+        return observe_spheres(_named(tuple(self.scans), robot), self.scans, self.diameter_mm, lambda *_: None)
 
 
 # Short tasks of the worker
@@ -319,11 +319,11 @@ class ScannedSpheres:
 def solved_poses(
     source: ReadBoards | ScannedSpheres, robot: Sequence[Any], options: Mapping[str, Any]
 ) -> HandEyeDocument:
-    """Solve by what the rig saw in poses of a robot. options : of a request."""
+    """Solve by the rig's observations in poses of a robot. options : of a request."""
     from slrig.calibration.hand_eye import HandEyeKind, solve_hand_eye
 
     given, kind = source.targets(robot), HandEyeKind(options["kind"])
-    found = solve_hand_eye(given.robot, given.seen, kind, robot_sigma=options["robot_sigma"])
+    found = solve_hand_eye(given.robot, given.observed, kind, robot_sigma=options["robot_sigma"])
     frames = {key: options[key] for key in ("base_frame", "flange_frame")}
     return hand_eye_document(found, source.calibration.solve_id, **frames, refused=given.refused)
 
@@ -331,11 +331,11 @@ def solved_poses(
 def checked_poses(
     source: ReadBoards | ScannedSpheres, robot: Sequence[Any], document: HandEyeDocument
 ) -> dict[str, Any]:
-    """What poses of a robot and what the rig saw in them say of a hand-eye calibration."""
+    """Check of a hand-eye calibration by poses of a robot and the rig's observations in them."""
     from slrig.calibration.hand_eye import check_hand_eye
 
     given = source.targets(robot)
-    drift = check_hand_eye(hand_eye_of(document), given.robot, given.seen)
+    drift = check_hand_eye(hand_eye_of(document), given.robot, given.observed)
     return {**drift._asdict(), "holds": drift.holds, "residual_mm": drift.residual_mm.tolist()}
 
 
@@ -347,10 +347,10 @@ def _posed(observations: Sequence[PoseObservation], board: Board, calibration: C
     from slrig.calibration.hand_eye import TargetPoses
     from slrig.calibration.health.drift import estimate_board_poses
 
-    seen = TargetPoses(*estimate_board_poses(observations, board, calibration))
+    observed = TargetPoses(*estimate_board_poses(observations, board, calibration))
     sigma = 0.0 if calibration.solved is None else calibration.solved.scale_sigma
-    longer = sigma * np.hstack([np.zeros((len(seen.poses), 3)), seen.poses[:, :3, 3]]).ravel()
-    return replace(seen, covariance=seen.covariance + np.outer(longer, longer))
+    longer = sigma * np.hstack([np.zeros((len(observed.poses), 3)), observed.poses[:, :3, 3]]).ravel()
+    return replace(observed, covariance=observed.covariance + np.outer(longer, longer))
 
 
 def _named(names: tuple[str, ...], robot: Sequence[Any]) -> RobotPoses:

@@ -104,7 +104,7 @@ class PoseJob(Job):
         return 2 * check_plan(self._scan, rig.facts)
 
     def capture(self, rig: RigSession, run: JobRun) -> Recording:
-        """Move the board if asked, and record a bundle."""
+        """Move the board to `position`, if any, and record a bundle."""
         opened = rig.open_whole()
         if self.position is not None and opened.positioner is not None:
             run.report("move", 0.0, self.position_name or "")
@@ -128,7 +128,7 @@ class PoseJob(Job):
             reading = pose_reading.read_pose(run.bundle, setting.board, f"pose {self.number}")
             judged = report.judgement(reading, session_readings(session), setting)
         except PoseRefusedError as error:
-            # The number stands beside it; and the person shot it just now.
+            # The number is shown with it.
             judged = report.Judgement((str(error).removeprefix(f"pose 'pose {self.number}': "),), {}, None)
         run.check()
         answer = {"refused": list(judged.refusals), "answer": judged.answer}
@@ -139,7 +139,7 @@ class PoseJob(Job):
                 write_durably(run.folder / picture_name(camera), picture)
             if reading is not None and not judged.refusals:
                 write_durably(run.folder / READING, reading_bytes(reading))
-        guidance = None if judged.standing is None else asdict(judged.standing)
+        guidance = None if judged.guidance is None else asdict(judged.guidance)
         fault = JobFailure(PoseRefusedError.code, " ".join(judged.refusals)) if judged.refusals else None
         return Outcome({"answer": judged.answer, "guidance": guidance}, fault)
 
@@ -221,9 +221,7 @@ def require_same_devices(record: SessionRecord, cameras: Mapping[str, Size], pro
 
 
 def session_devices(record: SessionRecord, facts: RigFacts) -> tuple[Mapping[str, Size], Size | None]:
-    """The extents of the rig's cameras, and of its projector; None in a session of cameras alone, whose poses carry no
-    codes.
-    """
+    """The extents of the rig's cameras, and of its projector; None in a session of cameras alone, without codes."""
     return facts.sizes, facts.projector.size if record.patterns.codes else None
 
 
@@ -232,13 +230,13 @@ def session_devices(record: SessionRecord, facts: RigFacts) -> tuple[Mapping[str
 
 def survey(session: Path) -> Mapping[str, Any]:
     """Coverage by the accepted poses of a session, and where to hold the board next, as JSON values."""
-    from slrig.calibrate.report import standing
+    from slrig.calibrate.report import session_guidance
 
-    return asdict(standing(session_readings(session), setting_of(read_session(session))))
+    return asdict(session_guidance(session_readings(session), setting_of(read_session(session))))
 
 
 def coverage_picture(session: Path, device: str, next_move: Mapping[str, Any]) -> bytes:
-    """A PNG of the board positions that a device has seen, and of the next one."""
+    """A PNG of the board positions in a device's views, and of the next one."""
     from slrig.calibrate.report import coverage_png
 
     return coverage_png(setting_of(read_session(session)), device, session_readings(session), next_move)
@@ -260,7 +258,7 @@ def warm() -> None:
 
 @dataclass(frozen=True, slots=True)
 class AxisJob(Job):
-    """The axis of the turntable from a board that stands on it, shot at `count` angles, `step_deg` apart from
+    """The axis of the turntable from a board on it, shot at `count` angles, `step_deg` apart from
     `first_deg` on.
     """
 
@@ -386,9 +384,7 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class PoseRequest:
-    """A pose that is asked for. position : index or name of a pose of the positioner; None leaves the board where it
-    is.
-    """
+    """A requested pose. position : index or name of a pose of the positioner; None leaves the board in place."""
 
     position: int | str | None = None
     exposure_s: float | None = None
@@ -424,8 +420,8 @@ class Calibrations:
         def load() -> None:
             try:
                 self._manager.worker.run(Task(warm, what="preparation"))
-            except Exception:  # noqa: BLE001 - the first pose will tell
-                _log.exception("what reads poses cannot be loaded")
+            except Exception:  # noqa: BLE001 - the first pose will report it
+                _log.exception("the code that reads poses cannot be loaded")
 
         threading.Thread(target=load, name="slrig-warm", daemon=True).start()
         return record
@@ -441,7 +437,7 @@ class Calibrations:
         key: str | None = None,
         holder: Holder | None = None,
     ) -> PoseRecord:
-        """Have a pose shot; `wait` lets it stand in line. Returns at once.
+        """Shoot a pose; with `wait` it may wait in line. Returns at once.
 
         key : the idempotency key of the request, reserved. holder : whom a refusal names meanwhile; None the pose.
 
@@ -483,23 +479,23 @@ class Calibrations:
         wait: bool,
         key: str | None = None,
     ) -> PoseRecord:
-        """Have poses of the positioner shot one after the other, and return the first; none means all of them.
+        """Shoot poses of the positioner one after the other, and return the first; none means all of them.
 
         Other work may come between two of them. A pose that fails or is cancelled ends the script; one that is refused
         does not. Raises as `shoot` does.
         """
         with self.register.lock:
             facts = self._manager.rig.facts
-            # Of a rig without positions, the first is asked for, and refused.
-            asked = positions or range(max(len(facts.positions) if facts is not None else 0, 1))
-            first, *others = [place for each in asked if (place := _position(each, facts)[0]) is not None]
+            # Of a rig without positions, the first is requested, and refused.
+            wanted = positions or range(max(len(facts.positions) if facts is not None else 0, 1))
+            first, *others = [place for each in wanted if (place := _position(each, facts)[0]) is not None]
             exposed = PoseRequest(first, request.exposure_s)
             pose = self.shoot(session_id, exposed, wait=wait, key=key)
             self._set_script(session_id, *others)
             return pose
 
     def cancel(self, session_id: UUID, number: int) -> PoseRecord:
-        """Ask a pose to end early, and the script that it belongs to. Returns at once; a pose that is over stays so."""
+        """Request the early end of a pose and of its script. Returns at once; a pose that is over stays so."""
         pose = self.register.pose(session_id, number)
         if not pose.state.final:
             self._set_script(session_id)
@@ -570,7 +566,7 @@ class Calibrations:
             if not record.accepted:
                 message = (
                     f"Calibration {session_id} has no accepted pose. Shoot some first "
-                    f"(POST /calibration/{session_id}/pose); GET /calibration/{session_id} tells what to shoot."
+                    f"(POST /calibration/{session_id}/pose); GET /calibration/{session_id} shows what to shoot."
                 )
                 raise SolveRefusedError(message)
             if measured_mm is not None and record.board is not None:
@@ -665,7 +661,7 @@ class Calibrations:
     def submit(self, text: bytes, ending: str, *, label: str | None = None) -> SessionRecord:
         """Make a calibration of a file's text: ours, or OpenCV's. `ending` is that of one of `EXPORTS`.
 
-        Raises CalibrationError if the text is no calibration, StorageError if the disk refused.
+        Raises CalibrationError if the text is not a calibration, StorageError if the disk refused.
         """
         session_id = uuid4()
         staged = self.store.stage_solve(session_id)
@@ -730,7 +726,7 @@ class Calibrations:
         return None if used is None else or_none(UUID, used.name)
 
     def pin(self, session_id: UUID, *, pinned: bool) -> SessionRecord:
-        """Have a calibration kept by every retention, or not any more.
+        """Exempt a calibration from every retention, or not any more.
 
         Raises CalibrationNotFoundError, StorageError.
         """
@@ -796,7 +792,7 @@ class Calibrations:
             self.store.discard(staged)
 
     def coverage_picture(self, session_id: UUID, device: str | None) -> bytes:
-        """Return a PNG of what a device has seen of the board so far; None means the first camera.
+        """Return a PNG of the board's positions in a device's views so far; None means the first camera.
 
         Raises CalibrationNotFoundError, ArtefactNotReadyError if it has no pose yet, and CameraNotFoundError if it has
         no such device.
@@ -828,9 +824,9 @@ class Calibrations:
         return self.register.all()
 
 
-def _position(asked: int | str | None, facts: RigFacts | None) -> tuple[int | None, str | None]:
+def _position(place: int | str | None, facts: RigFacts | None) -> tuple[int | None, str | None]:
     """The index and the name of a position. Raises UnsupportedByDeviceError."""
-    if asked is None:
+    if place is None:
         return None, None
     names = () if facts is None else facts.positions
     if not names:
@@ -838,17 +834,17 @@ def _position(asked: int | str | None, facts: RigFacts | None) -> tuple[int | No
             "position: this rig has no positioner, or is not open yet; hold the board yourself and leave position out"
         )
         raise UnsupportedByDeviceError(message)
-    if isinstance(asked, str) and asked in names:
-        return names.index(asked), asked
-    if isinstance(asked, int) and 0 <= asked < len(names):
-        return asked, names[asked]
-    message = f"position: found {asked!r}, this rig has 0 to {len(names) - 1}: {', '.join(names)}"
+    if isinstance(place, str) and place in names:
+        return names.index(place), place
+    if isinstance(place, int) and 0 <= place < len(names):
+        return place, names[place]
+    message = f"position: found {place!r}, this rig has 0 to {len(names) - 1}: {', '.join(names)}"
     raise UnsupportedByDeviceError(message)
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationArchive:
-    """The calibrations as a retention looks at them: see `Archive`. Those without a solve are counted apart.
+    """The calibrations for a retention: see `Archive`. Those without a solve are counted apart.
 
     scans : the folder of the scans, which name calibrations. named : gives further names that are needed.
     """
@@ -882,7 +878,7 @@ class CalibrationArchive:
         self.calibrations.delete(item, trash)
 
     def _names(self, record: SessionRecord) -> set[str]:
-        """What a scan may call it by."""
+        """Its names in scans."""
         names = {str(record.id)}
         for number in range(1, record.solve + 1):
             with suppress(CalibrationError, DamagedError):
@@ -891,9 +887,9 @@ class CalibrationArchive:
 
 
 def named_by_scans(scans: Path) -> set[str]:
-    """What the scans of a folder call the calibrations that they were measured by; of a solve's id, the session's part.
+    """Names of the calibrations in the scans of a folder; of a solve's id, the session's part.
 
-    A scan whose files cannot be read names none.
+    A scan with unreadable files names none.
     """
     names = set()
     for scan in (place for place in scans.iterdir() if not place.is_symlink()):

@@ -1,5 +1,5 @@
 """One pose of a calibration board, read from its frames: corners in every camera, the projector's light on the board,
-and figures that tell how well each camera saw it.
+and figures of the quality of each camera's view.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def window_about(region: Mask, margin_px: int) -> Window:
 
 
 def coded_axes(capture: Capture, camera: str, name: str) -> tuple[Axis, ...]:
-    """The axes whose codes a camera saw: both, or none.
+    """The axes with codes for a camera: both, or none.
 
     Raises
     ------
@@ -184,26 +184,26 @@ _LEVELS = 2
 _CLEAR_PX = 1.0
 _ALIKE = 0.9
 _LOST_PX = 1e3
-_FLOW_TELLS_PX = 0.12
-"""The flow of boards that stand still comes to half of this."""
+_MOVING_FLOW_PX = 0.12
+"""The flow of boards at rest comes to half of this."""
 _CHANCE = 27.9
-"""What the χ² of six numbers exceeds by chance in one of ten thousand cases."""
+"""The χ² of six numbers exceeds this by chance in one of ten thousand cases."""
 _LEAST_COMMON = 6
 _CHANGED, _CHANGED_SHARE = 0.1, 0.002
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-3)
 
 
 def moved_px(views: Sequence[Image], view: BoardView, board: Board, region: Mask, full_scale: float, /) -> float:
-    """The rms distance, px, of the corners from where the first frame shows them, less what noise makes of those that
-    stand still; NaN with one frame only.
+    """The rms distance, px, of the corners from where the first frame shows them, less the effect of noise on those at
+    rest; NaN with one frame only.
 
     The greatest over the frames, if all are below a pixel; otherwise that of the last frame that is not.
 
     views : (H, W) float32 each, frames of one pose in which the whole board is lit, in the order of time; region :
     (H, W) bool, the board. Corners are followed by the optical flow of their surroundings (Lucas and Kanade 1981),
-    which tells small movements. A larger one may carry a corner to the place of its neighbour, which looks alike; so
-    where the flow is large, or the frames are not much the same, the board is looked for anew, and `inf` stands for one
-    that is not found any more.
+    which measures small movements. A larger one may carry a corner to the place of its neighbour, which looks alike; so
+    where the flow is large, or the frames differ much, the board is searched again, and `inf` means that it is not
+    found.
     """
     if len(views) < 2:
         return float("nan")
@@ -219,13 +219,13 @@ def moved_px(views: Sequence[Image], view: BoardView, board: Board, region: Mask
             # Looking for the board takes long; how far it went further on the way matters no more.
             return _apart(views[0], each, board, full_scale)
         worst = max(worst, moved)
-    placed = _as_a_whole(views, view, board, full_scale)
-    return max([worst, *placed]) if worst > _FLOW_TELLS_PX or not placed else max(placed)
+    shifts = _as_a_whole(views, view, board, full_scale)
+    return max([worst, *shifts]) if worst > _MOVING_FLOW_PX or not shifts else max(shifts)
 
 
 def _as_a_whole(views: Sequence[Image], view: BoardView, board: Board, full_scale: float) -> list[float]:
-    """By how much all corners together moved from the first frame to one in the middle, and to the last, px; those of
-    which too few corners can be placed are left out.
+    """By how much all corners together moved from the first frame to one in the middle, and to the last, px; without
+    frames with too few corners.
     """
     chosen = sorted({0, len(views) // 2, len(views) - 1})
     before, *after = (refine_view(views[at], view, board, full_scale=full_scale) for at in chosen)
@@ -250,13 +250,13 @@ def _moved_together(before: BoardView, after: BoardView) -> float | None:
 
 
 def differ(first: Image, last: Image, full_scale: float, /) -> bool:
-    """Whether two frames in which all is lit show something else, somewhere."""
+    """Whether two fully lit frames differ somewhere."""
     changed = np.abs(last - first) > _CHANGED * full_scale
     return float(np.mean(changed)) > _CHANGED_SHARE
 
 
 def _apart(first: Image, image: Image, board: Board, full_scale: float) -> float:
-    """By how much the board moved from one frame to another, looked for in both: `view` may be of a mean of the two."""
+    """Movement of the board from one frame to another, found in both: `view` may be of a mean of the two."""
     try:
         before, after = (find_board(each, board, full_scale=full_scale) for each in (first, image))
     except PoseRefusedError:
@@ -280,7 +280,7 @@ def _flow(first: NDArray[np.uint8], image: NDArray[np.uint8], start: FloatArray)
 
 
 def _correlation(first: NDArray[np.uint8], image: NDArray[np.uint8], where: Mask) -> float:
-    """How alike two pictures of the board are, 1 for the same but for brightness and contrast."""
+    """Correlation of two pictures of the board, 1 if only brightness and contrast differ."""
     a, b = first[where].astype(np.float64), image[where].astype(np.float64)
     spread = float(a.std() * b.std())
     return float(np.mean((a - a.mean()) * (b - b.mean())) / spread) if spread > 0 else 0.0
@@ -295,9 +295,9 @@ def _rms(moved: FloatArray) -> float:
 
 
 MOST_LIGHT = 30_000
-"""Correspondences kept of one camera and axis. A pixel is drawn the more likely, the more it tells (1/σ²). Of pixels
-known five times less well than enough others none is: black ink adds a hundredth to what paper tells, and a camera's
-stray light displaces its positions most.
+"""Correspondences kept of one camera and axis. The probability of a pixel is proportional to its weight (1/σ²). Pixels
+with five times the σ of enough others are not drawn: black ink adds a hundredth to the information of paper, and a
+camera's stray light displaces its positions most.
 """
 
 _ENOUGH_LIGHT = 5_000
@@ -317,7 +317,7 @@ def read_pose(folder: Path, board: Board, name: str) -> ReadPose:
     PoseRefusedError
         As `read_captured` does.
     PatternError, BundleError
-        The frames are no sound capture.
+        The frames are not a sound capture.
     """
     return read_captured(read_capture(folder), board, name)
 
@@ -325,8 +325,8 @@ def read_pose(folder: Path, board: Board, name: str) -> ReadPose:
 def read_captured(capture: Capture, board: Board, name: str) -> ReadPose:
     """Read one pose from its frames.
 
-    A camera that does not see the board is left out, as long as another one does. A camera that was shown no codes, or
-    all of whose light on the board is unreadable while another camera's is not, has corners and no light.
+    A camera that does not see the board is left out, as long as another one does. A camera without codes, or with
+    unreadable light on all of the board while another camera's is readable, has corners and no light.
 
     Raises
     ------
@@ -351,13 +351,13 @@ def read_captured(capture: Capture, board: Board, name: str) -> ReadPose:
         except PoseRefusedError as cause:
             unseen.append(f"camera '{camera}': {_still_or(cause, frames, board, full_scale)}")
             continue
-        seen = _Seen(camera, view, frames, board, full_scale)
-        found = seen.light(capture, axes, name)
-        views[camera], figures[camera] = view, seen.figures(found)
+        observed = _BoardObservation(camera, view, frames, board, full_scale)
+        found = observed.light(capture, axes, name)
+        views[camera], figures[camera] = view, observed.figures(found)
         if found and all(len(each.position_px) >= _FEWEST_LIGHT for each in found):
             light[camera] = _joined(found)
         elif found:
-            unread.append(f"camera '{camera}': {seen.unread(found)}")
+            unread.append(f"camera '{camera}': {observed.unread(found)}")
     if not views:
         message = f"pose '{name}': no camera sees the board. {'; '.join(unseen)}"
         raise PoseRefusedError(message)
@@ -367,8 +367,8 @@ def read_captured(capture: Capture, board: Board, name: str) -> ReadPose:
     return ReadPose(PoseObservation(name, views, light), figures)
 
 
-class _Seen:
-    """The board in one camera, and what the frames tell of it."""
+class _BoardObservation:
+    """The board in the frames of one camera."""
 
     def __init__(self, camera: str, view: BoardView, frames: PoseFrames, board: Board, full_scale: float) -> None:
         self._camera = camera
@@ -380,8 +380,8 @@ class _Seen:
         self._shape = (shape[0], shape[1])
         self.region = board_mask(view, board, self._shape)
         self.blur_px = measure_blur_px(frames.white, view, board, full_scale=full_scale)
-        told = self.blur_px if np.isfinite(self.blur_px) else _USUAL_BLUR_PX
-        self._used_blur_px = float(np.clip(told, _USUAL_BLUR_PX, _MOST_BLUR_PX))
+        measured = self.blur_px if np.isfinite(self.blur_px) else _USUAL_BLUR_PX
+        self._used_blur_px = float(np.clip(measured, _USUAL_BLUR_PX, _MOST_BLUR_PX))
 
     def light(self, capture: Capture, axes: tuple[Axis, ...], name: str) -> tuple[ProjectorPositions, ...]:
         """The light on the board along each axis, in the whole camera's pixels; lit and decoded are of the board's."""
@@ -392,7 +392,7 @@ class _Seen:
         region = self.region[window]
         from_border = self._used_blur_px * 2 + _FROM_BORDER_PX
         distance = cv2.distanceTransform(np.pad(region, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1]
-        asked = (distance > from_border) & ~self._frames.clipped[window]
+        region_mask = (distance > from_border) & ~self._frames.clipped[window]
         found = []
         for axis in axes:
             try:
@@ -400,18 +400,18 @@ class _Seen:
             except PatternError as error:
                 message = f"pose '{name}': {error}"
                 raise PatternError(message) from error
-            seen = projector_positions(
-                frames, code_tables(frames, capture.projector), asked, CorrespondenceLimits(),
+            read = projector_positions(
+                frames, code_tables(frames, capture.projector), region_mask, CorrespondenceLimits(),
                 camera_blur_px=self._used_blur_px,
             )  # fmt: skip
             offset = np.array([window[1].start, window[0].start], dtype=np.float64)
             found.append(
-                replace(seen, pixels_px=seen.pixels_px + offset, lit=seen.lit & region, decoded=seen.decoded & region)
+                replace(read, pixels_px=read.pixels_px + offset, lit=read.lit & region, decoded=read.decoded & region)
             )
         return tuple(found)
 
     def figures(self, light: tuple[ProjectorPositions, ...]) -> ViewQuality:
-        """How well the camera saw the board."""
+        """Quality of the camera's view of the board."""
         frames = self._frames
         paper = paper_mask(self._view, self._board, self._shape)
         clear = interior_mask(self._view, self._board, self._shape, margin_px=2 * self._used_blur_px)
@@ -430,7 +430,7 @@ class _Seen:
         )
 
     def unread(self, light: tuple[ProjectorPositions, ...]) -> str:
-        """Why there is no light, and what to do."""
+        """Explain missing projector light, and what to do."""
         clipped = float(self._frames.clipped[self.region].mean())
         lit = float(np.mean([each.lit.sum() for each in light])) / max(int(self.region.sum()), 1)
         if clipped > 0.25:
@@ -447,7 +447,7 @@ class _Seen:
 
 
 def code_tables(frames: AxisFrames, projector: Size) -> CodeTables:
-    """What the patterns of one axis mean on this projector; what lies near its border is left out of them."""
+    """Code tables of the patterns of one axis on this projector, without the margin at its border."""
     gray, extent_px = frames.gray, projector.along(frames.axis)
     if has_phase(frames):
         position = line_positions(frames.line_patterns, gray, projector)
@@ -512,8 +512,8 @@ def axis_of_poses(
     *,
     refused: Mapping[str, str] | None = None,
 ) -> BoardAxis:
-    """The axis that a board was turned about. angles_deg : where the turntable says that it stood, pose by pose.
-    refused : the poses that could not be read, and why, for the words of a refusal.
+    """The axis that a board was turned about. angles_deg : stated angles of the turntable, pose by pose.
+    refused : the poses that could not be read, and why, for the message of a refusal.
 
     Raises
     ------

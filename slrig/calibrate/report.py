@@ -73,7 +73,7 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class DeviceFigures:
-    """One device: what was solved of it, and what is left over.
+    """One device: its solved parameters, and its residuals.
 
     values : by the names of `PARAMETERS` that describe the lens, and of `terms` only; centre_mm : its centre of
     projection in the world, a figure for each of x, y, z.
@@ -88,20 +88,20 @@ class DeviceFigures:
 
     @property
     def solved(self) -> Mapping[str, Figure]:
-        """Its `values`, and where it is unless that was held."""
-        placed = any(axis.sigma > 0 for axis in self.centre_mm)
+        """Its `values`, and its position unless that was held."""
+        is_free = any(axis.sigma > 0 for axis in self.centre_mm)
         place = dict(zip(("x_mm", "y_mm", "z_mm"), self.centre_mm, strict=True))
-        return {**self.values, **place} if placed else self.values
+        return {**self.values, **place} if is_free else self.values
 
     @property
     def held_out_ratio(self) -> float:
-        """The rms at poses that the solve had not seen over the rms at those that it had; NaN if there were too few."""
+        """The rms at poses held out from the solve over the rms at those in it; NaN if there were too few."""
         return self.residuals.held_out_rms_px / self.residuals.rms_px if self.residuals.rms_px > 0 else math.nan
 
 
 @dataclass(frozen=True, slots=True)
 class Baseline:
-    """Two devices: how far apart they are, and at what angle they look at the middle of the working volume."""
+    """Two devices: their distance, and the angle between their views of the middle of the working volume."""
 
     first: str
     second: str
@@ -126,7 +126,7 @@ class PoseFigures:
 def device_figures(result: CalibrationResult) -> tuple[DeviceFigures, ...]:
     """Every device, cameras in order, then the projector."""
     found = []
-    for name, device, place in _placed(result.calibration):
+    for name, device, place in _device_rows(result.calibration):
         covariance = result.solution.covariance[place, place]
         terms = tuple(term for term in LENS_TERMS if term in result.solution.distortion.get(name, ()))
         numbers = [device.matrix[0, 0], device.matrix[1, 1], device.matrix[0, 2], device.matrix[1, 2]]
@@ -146,7 +146,7 @@ def baselines(result: CalibrationResult) -> tuple[Baseline, ...]:
     """Every pair of devices, in the order of the devices."""
     middle = result.expected.volume_mm.mean(axis=0)
     found = []
-    for (first, one, own), (second, other, its) in combinations(_placed(result.calibration), 2):
+    for (first, one, own), (second, other, its) in combinations(_device_rows(result.calibration), 2):
         rows = np.r_[own, its]
         shared = result.solution.covariance[np.ix_(rows, rows)]
         length = _propagated((one, other), shared, lambda pair: float(np.linalg.norm(pair[1][1] - pair[0][1])))
@@ -156,7 +156,7 @@ def baselines(result: CalibrationResult) -> tuple[Baseline, ...]:
 
 
 def pose_figures(result: CalibrationResult, board: Board, names: Sequence[str]) -> tuple[PoseFigures, ...]:
-    """Every pose of `names`, in their order, and then those that the result knows beside them."""
+    """Every pose of `names`, in their order, and then others of the result."""
     solution = result.solution
     known = [*solution.poses, *solution.outliers]
     first = next(iter(result.calibration.cameras.values()))
@@ -171,8 +171,8 @@ def pose_figures(result: CalibrationResult, board: Board, names: Sequence[str]) 
         tilt = distance = math.nan
         if (pose := solution.poses.get(name)) is not None:
             turned, moved_mm = first.rotation @ pose.rotation, first.rotation @ pose.translation_mm
-            seen = attitude(BoardPose(turned, moved_mm + first.translation_mm), middle_mm)
-            tilt, distance = seen.incidence_deg, seen.distance_mm
+            view = attitude(BoardPose(turned, moved_mm + first.translation_mm), middle_mm)
+            tilt, distance = view.incidence_deg, view.distance_mm
         found.append(PoseFigures(name, rms, tilt, distance, solution.outliers.get(name, "")))
     return tuple(found)
 
@@ -183,7 +183,7 @@ def named_devices(calibration: Calibration) -> Mapping[str, Pinhole]:
     return {**calibration.cameras, **projector}
 
 
-def _placed(calibration: Calibration) -> list[tuple[str, Pinhole, slice]]:
+def _device_rows(calibration: Calibration) -> list[tuple[str, Pinhole, slice]]:
     """Each device with its rows in the covariance."""
     rows = len(PARAMETERS)
     named = named_devices(calibration).items()
@@ -239,7 +239,7 @@ def rounded(value: float, digits: int = 3) -> str:
 
 
 _ARROW_SHARE = 0.42
-"""The longest arrow, of a cell's shorter side: it stays within the cell, whose middle it has."""
+"""The longest arrow, of a cell's shorter side: it stays within the cell, in its middle."""
 _POINTS_ALONG = 8
 """Points to a side of the board, so that the lens bends its outline smoothly."""
 _MARGIN = 34.0
@@ -269,9 +269,9 @@ def residual_map(residuals: DeviceResiduals, size: Size, *, name: str, most_px: 
             continue
         mean, count = residuals.map_mean_px[row, column], int(residuals.map_count[row, column])
         fill, ink = ramp_colour(rms / most_px), ink_on(rms / most_px)
-        told = shape("title", f"rms {rms:.3f} px of {count:,}; mean {mean[0]:+.3f}, {mean[1]:+.3f} px")
+        title = shape("title", f"rms {rms:.3f} px of {count:,}; mean {mean[0]:+.3f}, {mean[1]:+.3f} px")
         parts += [
-            shape("rect", told, **box, fill=fill, class_="cell"),
+            shape("rect", title, **box, fill=fill, class_="cell"),
             _arrow(np.array([x + wide / 2, y + 0.62 * high]), scale * mean, ink),
             shape("text", f"{rms:.3f}", x=x + wide / 2, y=y + 11, class_="cell-value", fill=ink),
         ]
@@ -311,7 +311,7 @@ def coverage_map(
 def error_slices(expected: ExpectedError, *, most: int = 3) -> list[tuple[float, Markup]]:
     """The error of a point in slices across the volume, each with its z in mm, near to far, all in the same colours.
 
-    The world is the first camera's frame: x to its right, y down, and a slice is seen as the camera sees it.
+    The world is the first camera's frame: x to its right, y down, and a slice is drawn as the camera sees it.
     """
     levels = np.unique(np.round(expected.grid_mm[:, _Z], 3))
     # Not the very ends: of those the board reached a corner only.
@@ -341,9 +341,9 @@ def _slice(expected: ExpectedError, z_mm: float) -> Markup:
     for place, error in zip(places, errors, strict=True):
         share = (float(error) - least) / max(most - least, 1e-12)
         x, y = scale * (place - step / 2 - low)
-        told = shape("title", f"x {place[_X]:.0f}, y {place[_Y]:.0f}, z {z_mm:.0f} mm: {rounded(error)} mm")
+        title = shape("title", f"x {place[_X]:.0f}, y {place[_Y]:.0f}, z {z_mm:.0f} mm: {rounded(error)} mm")
         # A little wider than the grid: no seams between neighbours of nearly one colour.
-        parts.append(shape("rect", told, x=x, y=y, width=wide + 0.4, height=tall + 0.4, fill=ramp_colour(share)))
+        parts.append(shape("rect", title, x=x, y=y, width=wide + 0.4, height=tall + 0.4, fill=ramp_colour(share)))
         if numbered:
             number, middle = f"{1000 * error:.{decimals}f}", {"x": x + wide / 2, "y": y + tall / 2 + 3}
             parts.append(shape("text", number, **middle, class_="cell-value", fill=ink_on(share)))
@@ -360,7 +360,7 @@ def rig_view(
 ) -> Markup:
     """The bench to scale: devices with what they see, the board in every pose, and the working volume.
 
-    The first camera looks to the right. From above, so that its right (x) is down the page, or from aside (y down).
+    The first camera points to the right. From above, so that its right (x) is down the page, or from aside (y down).
     """
     axes = [_Z, _Y if aside else _X]
     named = named_devices(calibration)
@@ -372,18 +372,18 @@ def rig_view(
     scale = (WIDTH - 2 * _MARGIN) / max(high[0] - low[0], 1e-9)
     height = scale * (high[1] - low[1]) + 2 * _MARGIN
 
-    def placed(points: FloatArray) -> FloatArray:
+    def scaled(points: FloatArray) -> FloatArray:
         return np.asarray((points - low) * scale + _MARGIN)
 
     parts = [
         *(
-            polygon(placed(cone), "cone light" if name == PROJECTOR else "cone")
+            polygon(scaled(cone), "cone light" if name == PROJECTOR else "cone")
             for name, cone in zip(named, cones, strict=True)
         ),
-        polygon(placed(corners), "volume"),
-        *(polygon(placed(outline), "board") for outline in boards),
+        polygon(scaled(corners), "volume"),
+        *(polygon(scaled(outline), "board") for outline in boards),
     ]
-    spots = [placed(device.centre_mm[axes]) for device in named.values()]
+    spots = [scaled(device.centre_mm[axes]) for device in named.values()]
     for name, (x, y), shift in zip(named, spots, _label_shifts(spots), strict=True):
         kind = "projector" if name == PROJECTOR else "camera"
         parts += [
@@ -399,7 +399,7 @@ def rig_view(
 
 
 def _label_shifts(spots: Sequence[FloatArray]) -> list[float]:
-    """For each spot how far below it its label stands: below, unless another device is close by there; then above."""
+    """For each spot the distance of its label below it: below, unless another device is close by there; then above."""
 
     def beneath(at: int, other: int) -> bool:
         across, down = spots[other] - spots[at]
@@ -422,7 +422,7 @@ def _cone(device: Pinhole, far_mm: float, *, aside: bool) -> FloatArray:
 
 
 def _outline_mm(board: Board, pose: BoardPose, *, along: int = 1) -> FloatArray:
-    """(4 along, 3) float64: the edge of what is printed, in the world, `along` points to a side."""
+    """(4 along, 3) float64: the edge of the print, in the world, `along` points to a side."""
     corners = np.pad(_rectangle(*board.print_mm), ((0, 0), (0, 1)))
     steps = np.arange(along)[:, None, None] / along
     outline_mm = (corners + steps * (np.roll(corners, -1, axis=0) - corners)).swapaxes(0, 1).reshape(-1, 3)
@@ -486,7 +486,7 @@ def report_html(
     poses : the poses that the solve was given, in their order.
     pictures : by pose and camera, its white frame, (H, W) or (H, W, 3) uint8, blue, green, red.
     remarks : by pose, what could be better about it. refused : by pose, why it could not be read at all.
-    machine : where it was solved, in words.
+    machine : name of the machine that solved it, for people.
     """
     expected = result.expected
     devices = device_figures(result)
@@ -532,13 +532,13 @@ def _pictures(
     pictures: Mapping[str, Mapping[str, Pixels]],
     board: Board,
 ) -> Iterable[tuple[str, str]]:
-    """The address of each picture with corners drawn in, and what it is of."""
+    """The address of each picture with corners drawn in, and its title."""
     views = {pose.observation.name: pose.observation.views for pose in poses}
     for pose in shown:
         for camera, picture in pictures.get(pose.name, {}).items():
-            words = f"{pose.name}, {device_title(camera)}" + (" — left out" if pose.left_out else "")
+            title = f"{pose.name}, {device_title(camera)}" + (" — left out" if pose.left_out else "")
             drawn = draw_pose(picture, views.get(pose.name, {}).get(camera), board, width_px=_PICTURE_PX)
-            yield jpeg_uri(drawn[..., ::-1], _QUALITY), words
+            yield jpeg_uri(drawn[..., ::-1], _QUALITY), title
 
 
 def _coverage(result: CalibrationResult, poses: Sequence[ReadPose], board: Board, name: str) -> Markup:
@@ -577,7 +577,7 @@ def white_frame(bundle: Path, camera: str) -> Pixels:
 
 
 def coverage_png(setting: Setting, device: str, poses: Sequence[ReadPose], next_move: Mapping[str, Any]) -> bytes:
-    """Return what a device has seen of the board, or lit, and where the board goes next.
+    """Picture of the board's positions in a device's view, or its light, and of the next one.
 
     next_move : as a session keeps it (`slrig.calibrate.report`).
     """
@@ -610,7 +610,7 @@ def _png(picture: NDArray[np.uint8]) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class SessionGuidance:
-    """Where a session stands: what its poses cover, and what to move next and why; JSON values."""
+    """Guidance of a session: the coverage of its poses, and the next move with its reason; JSON values."""
 
     coverage: Mapping[str, Any]
     next_move: Mapping[str, Any]
@@ -618,13 +618,13 @@ class SessionGuidance:
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """Judgement of a pose. refusals : why it cannot be used, in words; none if it can. answer : its figures, as JSON
-    values. standing : where the session stands with it, None where it could not be read.
+    """Judgement of a pose. refusals : why it cannot be used; none if it can. answer : its figures, as JSON values.
+    guidance : of the session with it, None where it could not be read.
     """
 
     refusals: tuple[str, ...]
     answer: Mapping[str, Any]
-    standing: SessionGuidance | None
+    guidance: SessionGuidance | None
 
 
 _ANSWER = (
@@ -641,24 +641,24 @@ _ANSWER = (
 """Fields of `slrig.calibration.poses.checks.PoseAssessment` that belong to the pose alone."""
 
 _CHECK = ("poses", "difference_mm", "stated_mm", "ratio", "chance", "fits", "words")
-"""Fields of `slrig.calibration.accuracy.OddEven`, whose `motion` stands beside them."""
+"""Fields of `slrig.calibration.accuracy.OddEven` next to its `motion`."""
 
 
 def judgement(pose: ReadPose, earlier: Sequence[ReadPose], setting: Setting) -> Judgement:
-    """Return what to tell of a pose, the accepted ones before it at hand."""
+    """Judge a pose, with the accepted ones before it."""
     observations = [each.observation for each in earlier]
     found = check_pose(pose.observation, pose.figures, observations, setting.board, setting.sizes)
-    stands = _standing(found.coverage, found.advice, pose.observation)
-    return Judgement(found.refusals, _fields(found, *_ANSWER), stands)
+    guidance = _guidance(found.coverage, found.advice, pose.observation)
+    return Judgement(found.refusals, _fields(found, *_ANSWER), guidance)
 
 
-def standing(poses: Sequence[ReadPose], setting: Setting) -> SessionGuidance:
-    """Return what the accepted poses cover, and what to move next."""
+def session_guidance(poses: Sequence[ReadPose], setting: Setting) -> SessionGuidance:
+    """Coverage of the accepted poses, and the next move."""
     observations = [each.observation for each in poses]
     guess = estimate_rig(observations, setting.board, setting.sizes)
     covered = coverage(observations, setting.board, setting.sizes, rig=guess)
     advice = advise_pose(observations, setting.board, setting.sizes, rig=guess, covered=covered)
-    return _standing(covered, advice, observations[-1] if observations else None)
+    return _guidance(covered, advice, observations[-1] if observations else None)
 
 
 def summary(result: CalibrationResult) -> Mapping[str, Any]:
@@ -691,8 +691,8 @@ def summary(result: CalibrationResult) -> Mapping[str, Any]:
         "poses": list(solution.poses),
         "outliers": solution.outliers,
     }
-    told: dict[str, Any] = plain(figures)
-    return told
+    document: dict[str, Any] = plain(figures)
+    return document
 
 
 def write_report(
@@ -719,14 +719,14 @@ def warm() -> None:
     importlib.import_module("slrig.calibrate.pose_reading")
 
 
-def _standing(found: Coverage, advice: Advice, last: PoseObservation | None) -> SessionGuidance:
-    """Last : the pose shot last, which tells where the board is now."""
+def _guidance(found: Coverage, advice: Advice, last: PoseObservation | None) -> SessionGuidance:
+    """Last : the pose shot last, which shows the present place of the board."""
     shown = ("cells", "reachable", "share", "depths", "tilted", "turns", "distance_mm")
     devices = {name: _fields(each, *shown) for name, each in found.devices.items()}
-    told = _fields(advice, "enough", "camera", "outline_px", "worst_px", "expected_px")
+    move = _fields(advice, "enough", "camera", "outline_px", "worst_px", "expected_px")
     view = None if last is None or advice.camera is None else last.views.get(advice.camera)
     from_px = None if view is None or not len(view.points_px) else view.points_px.mean(axis=0)
-    next_move = {"words": advice.text, **told, "from_px": plain(from_px)}
+    next_move = {"words": advice.text, **move, "from_px": plain(from_px)}
     return SessionGuidance({**_fields(found, "poses", "missing"), "devices": devices}, next_move)
 
 

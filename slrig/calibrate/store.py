@@ -76,7 +76,7 @@ USUAL_PATTERNS = PatternPlan(sequence=SequenceName.ROBUST, rows=True)
 
 
 class SessionState(StrEnum):
-    """Where a session stands. Another pose opens a solved or failed one again."""
+    """State of a session. Another pose opens a solved or failed one again."""
 
     OPEN = "open"
     SOLVING = "solving"
@@ -88,8 +88,8 @@ class SessionState(StrEnum):
 class PoseRecord:
     """One pose, as its job says. `number` counts from 1 within the session and is never given twice.
 
-    state : one that is accepted has succeeded. position : index of the pose that the positioner was asked for, None
-    where a person holds the board. answer : what was found of it, as JSON values, see `slrig.calibrate.report`;
+    state : one that is accepted has succeeded. position : index of the requested pose of the positioner, None where a
+    person holds the board. answer : its findings, as JSON values, see `slrig.calibrate.report`;
     None until read. fault : why it was refused or failed. seconds : from the last frame to the answer.
     """
 
@@ -147,7 +147,7 @@ class SessionRecord:
     never SOLVING. solve : the number of the last solve that went well, 0 before; result : its figures as JSON values.
     script : positions that are still to be taken. pinned : no retention removes it.
 
-    The last four are of its jobs, and not on disk. fault : of the last solve. progress : of what is under way.
+    The last four are of its jobs, and not on disk. fault : of the last solve. progress : of the job under way.
     under_way : whether a pose is being shot or read, or a solve runs.
     """
 
@@ -257,7 +257,7 @@ class ReadPose:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationResult:
-    """A solved calibration with all that is told of it.
+    """A solved calibration with all of its figures.
 
     calibration : carries its own error (`solved`). odd_even : what the odd and the even poses differ by, solved apart,
     against what is stated for that; None where there are too few.
@@ -295,7 +295,7 @@ def solve_poses(
     SolveRefusedError
         The poses determine no calibration, or do not span a volume to state an error for.
     """
-    # Late: the service knows these values, and loads no compiled kernel before somebody solves.
+    # Late: the service knows these values, and loads no compiled kernel before the first solve.
     from slrig.calibration.accuracy import expected_error
     from slrig.calibration.solving import solve
 
@@ -364,22 +364,22 @@ class ActivePointer:
 class CalibrationStore:
     """Reads and writes calibrations below a data folder. One process uses it; callers hold their own lock.
 
-    Whatever writes raises StorageError when the disk refuses.
+    Methods that write raise StorageError when the disk refuses.
     """
 
     def __init__(self, folder: DataFolder) -> None:
         self._folder = folder
 
     def folder(self, session_id: UUID) -> Path:
-        """Where a calibration lies."""
+        """Folder of a calibration."""
         return self._folder.calibrations / str(session_id)
 
     def pose(self, session_id: UUID, number: int) -> Path:
-        """Where a pose lies once it was read."""
+        """Folder of a pose once it was read."""
         return self.folder(session_id) / "poses" / f"{number:02d}"
 
     def solve(self, session_id: UUID, number: int) -> Path:
-        """Where the results of a solve lie."""
+        """Folder of the results of a solve."""
         return self.folder(session_id) / "solves" / str(number)
 
     def load(self) -> Sequence[SessionRecord]:
@@ -410,7 +410,7 @@ class CalibrationStore:
                 raise
 
     def save(self, session: SessionRecord) -> None:
-        """Put a session on record in place of what it was."""
+        """Write the record of a session."""
         write_file(self.folder(session.id) / SESSION, session_json(session))
 
     def delete(self, session_id: UUID, trash: Path | None = None) -> None:
@@ -457,7 +457,7 @@ class CalibrationStore:
             with disk_errors(path):
                 document = stored_json(path.read_bytes())
             if document["format"] != _ACTIVE_FORMAT:
-                raise KeyError(document["format"])  # noqa: TRY301 - told with the other faults of the file
+                raise KeyError(document["format"])  # noqa: TRY301 - reported with the other faults of the file
             return ActivePointer(UUID(document["id"]), int(document["solve"]))
         except FileNotFoundError:
             return None
@@ -510,7 +510,7 @@ def read_session(folder: Path) -> SessionRecord:
 
 
 def session_readings(folder: Path) -> list[ReadPose]:
-    """What was read of the accepted poses of a session, by their numbers. Raises StorageError: it cannot be read."""
+    """Readings of the accepted poses of a session, by their numbers. Raises StorageError: it cannot be read."""
     found = [_pose_place(folder, job) for job in _poses_on_disk(folder) if job.fault is None]
     for place in found:
         require_whole(place, READING, remedy="Drop that pose (DELETE …/pose/N) and shoot it again.")
@@ -537,7 +537,7 @@ _READ_PARTS: dict[str, type[Any]] = {"view": BoardView, "light": Correspondences
 
 
 def reading_bytes(pose: ReadPose) -> bytes:
-    """What was read of a pose as the bytes of an .npz file: one array per field of each part of each camera."""
+    """The reading of a pose as the bytes of an .npz file: one array per field of each part of each camera."""
     parts = zip(_READ_PARTS, (pose.observation.views, pose.observation.correspondences, pose.figures), strict=True)
     arrays = {
         f"{part}/{camera}/{field}": np.asarray(value)
@@ -574,7 +574,7 @@ _log = structlog.get_logger(__name__)
 
 
 class CalibrationRegister:
-    """Holds every session in memory, and each change of one on disk before it is seen.
+    """Holds every session in memory, and each change of one on disk before it is visible.
 
     jobs : the poses and the solves. `lock` may be held over several calls. Only the process that holds the data folder
     makes one.

@@ -104,7 +104,7 @@ class VerificationJob(Job):
         return check_plan(self._scan, rig.facts)
 
     def capture(self, rig: RigSession, run: JobRun) -> Recording:
-        """Move the board if asked, and record a bundle with the calibration that is to be verified."""
+        """Move the board to `position`, if any, and record a bundle with the calibration to verify."""
         opened = rig.open_whole()
         if self.position is not None and opened.positioner is not None:
             opened.positioner.move(self.position)
@@ -127,8 +127,8 @@ class VerificationJob(Job):
 def verify_bundle(folder: Path, board: Board, calibration: Calibration) -> Verification:
     """Judge a calibration by a recorded pose of the board.
 
-    Raises PoseRefusedError if the board is not to be seen, or moved while it was shot; CalibrationError if the
-    calibration is of other cameras; BundleError, PatternError if the frames are no sound capture.
+    Raises PoseRefusedError if the board is not visible, or moved while it was shot; CalibrationError if the calibration
+    is of other cameras; BundleError, PatternError if the frames are not a sound capture.
     """
     # Late: the service knows these values, and loads no mathematics.
     from slrig.calibrate.pose_reading import read_pose
@@ -212,7 +212,7 @@ class HealthStore:
     ) -> VerificationRecord:
         """Judge a verification with those before it of its calibration, and put it on record. Raises StorageError.
 
-        job_id : what has found it; what that has found before, as before a kill, stands.
+        job_id : of its job; an earlier verification of that, as before a kill, stays.
         """
         with self.database.changing() as session:
             name = str(job_id or uuid4())
@@ -258,7 +258,7 @@ class HealthStore:
         return next(iter(self.history(limit=1)), None)
 
     def last_by_board(self, calibration: str) -> Verification | None:
-        """What the newest verification of a calibration with the board found: a scan's tells no error."""
+        """The newest verification of a calibration with the board: a scan's states no error."""
         query = select(VerificationRow).where(VerificationRow.calibration == calibration)
         with self.database.reading() as session:
             board = query.where(VerificationRow.kind == "board").order_by(VerificationRow.number.desc()).limit(1)
@@ -273,7 +273,7 @@ class HealthStore:
             return [*readable(rows, _record)][::-1]
 
     def health_of(self, calibration: str) -> Health:
-        """What the last verification of a calibration came to; unknown where there was none."""
+        """Health by the last verification of a calibration; unknown where there was none."""
         found = self.since_calibration(calibration, limit=1)
         return found[-1].health if found else judge_health([])
 
@@ -290,8 +290,7 @@ def _stamp(moment: datetime) -> str:
 
 
 class RigHealth:
-    """What is known of the calibration in use: see `Group`. It learns from verifications and from scans. Any thread may
-    call.
+    """Health of the calibration in use: see `Group`. It learns from verifications and scans. Any thread may call.
 
     store : the history. A verification's summary is `VerificationRecord.document` of what was found.
     """
@@ -359,7 +358,7 @@ Records = Sequence[VerificationRecord]
 
 
 def health_svg(records: Records, /, *, thresholds: Thresholds = THRESHOLDS) -> Markup:
-    """The picture of verifications, oldest first. With none it says so in words."""
+    """The picture of verifications, oldest first. With none it says so."""
     if not records:
         return nothing_yet("Nothing was verified yet. POST /rig/verification shoots one.")
     second = TOP + PANEL + GAP
@@ -369,8 +368,8 @@ def health_svg(records: Records, /, *, thresholds: Thresholds = THRESHOLDS) -> M
         *_recalibrations(records, second + PANEL),
         *times(_moments(records), second + PANEL),
     ]
-    words = f"health of the rig over {len(records)} verifications, now {records[-1].health.state}"
-    return trend(words, HEIGHT, parts)
+    title = f"health of the rig over {len(records)} verifications, now {records[-1].health.state}"
+    return trend(title, HEIGHT, parts)
 
 
 def _moments(records: Records) -> list[datetime]:
@@ -378,12 +377,12 @@ def _moments(records: Records) -> list[datetime]:
 
 
 def _errors(records: Records, at: Thresholds, top: float) -> list[Markup]:
-    # A calibration that says nothing of its own error, and a scan, tell none.
+    # A calibration without an error of its own, and a scan, have none.
     errors = [record.found.error_ratio for record in records]
     known = [error for error in errors if error is not None]
     if not known:
-        words = "No verification tells a change: they are of scans, or the calibration does not tell its own error."
-        return [shape("text", words, x=LEFT, y=top + 20)]
+        text = "No verification shows a change: they are of scans, or the calibration does not state its own error."
+        return [shape("text", text, x=LEFT, y=top + 20)]
     panel = Panel(_moments(records), top, max(*known, 1.2 * at.watch_error_ratio), "Change since calibration")
     panel.limit(1.0, "as calibrated", _COLOURS[HealthState.UNKNOWN])
     for state, ratio in ((HealthState.WATCH, at.watch_error_ratio), (HealthState.STALE, at.stale_error_ratio)):
@@ -391,8 +390,8 @@ def _errors(records: Records, at: Thresholds, top: float) -> list[Markup]:
     panel.line(errors, PALE, of=[record.calibration for record in records])
     for record, error in zip(records, errors, strict=True):
         if error is not None:
-            words = f"{record.health.state}. {'; '.join(record.health.reasons)}"
-            panel.dot(record.at, error, _COLOURS[record.health.state], words)
+            text = f"{record.health.state}. {'; '.join(record.health.reasons)}"
+            panel.dot(record.at, error, _COLOURS[record.health.state], text)
     for number, state in enumerate((HealthState.GOOD, HealthState.WATCH, HealthState.STALE)):
         x = END - 190 + 64 * number
         panel.parts.append(shape("circle", cx=x, cy=top - 16, r=3.2, fill=_COLOURS[state]))

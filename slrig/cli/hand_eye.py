@@ -11,13 +11,13 @@ from rich.markup import escape
 
 from slrig.bundle import CALIBRATION, read_calibration
 from slrig.calibrate.hand_eye import (
-    SeenTargets,
+    ObservedTargets,
     hand_eye_document,
     hand_eye_of,
-    paired,
+    observe_boards,
+    observe_spheres,
+    pair_poses,
     read_hand_eye,
-    seen_boards,
-    seen_spheres,
     write_hand_eye,
 )
 from slrig.calibration.hand_eye import HandEyeKind, TargetPoses, check_hand_eye, solve_hand_eye
@@ -33,7 +33,7 @@ from slrig.scan.artefacts import MESH
 
 def observed_by_rig(
     poses: Path, seen: Path, rotation: str | None, board: BoardArguments, calibration: Path | None, sphere: float | None
-) -> tuple[SeenTargets, str | None]:
+) -> tuple[ObservedTargets, str | None]:
     """The robot's poses with the rig's observations, and the identifier of the rig's calibration.
 
     Raises CalibrationError, BundleError, PoseRefusedError.
@@ -42,11 +42,11 @@ def observed_by_rig(
     robot = read_robot_poses(poses, rotation)
     if seen.is_file():
         body = read_robot_poses(seen, rotation)
-        kept = paired(robot, dict.fromkeys(body.names, seen))
+        kept = pair_poses(robot, dict.fromkeys(body.names, seen))
         chosen = np.array([body.names.index(name) for name in kept.names], dtype=np.intp)
         exact = np.zeros((6 * len(chosen),) * 2)
         identifier = None if calibration is None else read_calibration(calibration).solve_id
-        return SeenTargets(kept, TargetPoses(kept.names, body.poses[chosen], exact), {}), identifier
+        return ObservedTargets(kept, TargetPoses(kept.names, body.poses[chosen], exact), {}), identifier
     scans: dict[str, Path] = {}
     if sphere is not None:
         scans = {path.name: path for path in sorted(seen.iterdir() if seen.is_dir() else ()) if (path / MESH).is_file()}
@@ -69,18 +69,18 @@ def observed_by_rig(
             display("reading", fraction, detail)
 
         if of_rig is None or sphere is not None:
-            given = seen_spheres(paired(robot, scans), scans, sphere or 0.0, report)
+            given = observe_spheres(pair_poses(robot, scans), scans, sphere or 0.0, report)
         else:
-            given = seen_boards(paired(robot, folders), folders, chosen_board(board), of_rig, report)
+            given = observe_boards(pair_poses(robot, folders), folders, chosen_board(board), of_rig, report)
         display("done", 1.0, "")
     return given, None if of_rig is None else of_rig.solve_id
 
 
 def solve_poses(
-    given: SeenTargets, identifier: str | None, kind: str, robot: RobotOptions, output: Path, *, as_json: bool
+    given: ObservedTargets, identifier: str | None, kind: str, robot: RobotOptions, output: Path, *, as_json: bool
 ) -> dict[str, Any]:
     """Solve, write the file, print and return it. Raises SolveRefusedError, StorageError."""
-    found = solve_hand_eye(given.robot, given.seen, HandEyeKind(kind), robot_sigma=robot.robot_sigma)
+    found = solve_hand_eye(given.robot, given.observed, HandEyeKind(kind), robot_sigma=robot.robot_sigma)
     document = hand_eye_document(
         found, identifier, base_frame=robot.base_frame, flange_frame=robot.flange_frame, refused=given.refused
     )
@@ -113,12 +113,12 @@ def solve_poses(
     return plain
 
 
-def check_poses(given: SeenTargets, identifier: str | None, file: Path, *, as_json: bool) -> bool:
+def check_poses(given: ObservedTargets, identifier: str | None, file: Path, *, as_json: bool) -> bool:
     """Print the drift of new poses from a hand-eye calibration; return whether it holds. Raises CalibrationError."""
     document = read_hand_eye(file)
-    drift = check_hand_eye(hand_eye_of(document), given.robot, given.seen)
+    drift = check_hand_eye(hand_eye_of(document), given.robot, given.observed)
     other = document.calibration != identifier and None not in (document.calibration, identifier)
-    rows = list(zip(given.seen.names, drift.residual_mm.tolist(), drift.residual_deg.tolist(), strict=True))
+    rows = list(zip(given.observed.names, drift.residual_mm.tolist(), drift.residual_deg.tolist(), strict=True))
     if as_json:
         print_json({
             "holds": drift.holds, "probability": drift.probability, "shift_mm": drift.shift_mm,

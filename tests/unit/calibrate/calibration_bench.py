@@ -71,7 +71,7 @@ class TameCalibrating:
             {
                 "calibrate.pose_reading.read_pose": self._read,
                 "calibrate.report.judgement": self._judge,
-                "calibrate.report.standing": lambda poses, _: SessionGuidance(
+                "calibrate.report.session_guidance": lambda poses, _: SessionGuidance(
                     {"poses": [each.observation.name for each in poses]}, {}
                 ),
                 "calibrate.report.write_report": lambda path, *_: path.write_text("<html>report</html>"),

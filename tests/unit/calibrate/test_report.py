@@ -364,15 +364,15 @@ def test_each_pose_is_judged_without_a_word_of_light() -> None:
     setting = Setting(CHESSBOARD, {"left": SIZE}, None)
     found = judgement(poses_of_one()[0][5], poses_of_one()[0][:5], setting)
     assert found.refusals == ()
-    assert found.standing is not None
-    words = json.dumps([found.answer, found.standing.coverage, found.standing.next_move], allow_nan=False)
+    assert found.guidance is not None
+    words = json.dumps([found.answer, found.guidance.coverage, found.guidance.next_move], allow_nan=False)
     assert "projector" not in words
     # Where the board was shot last, for an arrow from there.
     (view,) = poses_of_one()[0][5].observation.views.values()
-    assert found.standing.next_move["from_px"] == pytest.approx(view.points_px.mean(axis=0).tolist())
+    assert found.guidance.next_move["from_px"] == pytest.approx(view.points_px.mean(axis=0).tolist())
     first = judgement(poses_of_one()[0][0], (), setting)
-    assert first.standing is not None
-    assert "projector" not in json.dumps(first.standing.next_move)
+    assert first.guidance is not None
+    assert "projector" not in json.dumps(first.guidance.next_move)
 
 
 def test_it_is_no_calibration_for_scans_and_is_compared_by_its_lens() -> None:

@@ -290,6 +290,6 @@ def test_thresholds_and_the_recalibration_are_named() -> None:
 def test_a_calibration_that_states_no_error_has_no_axis_of_it() -> None:
     record = warm_up()[0]
     silent = replace(record, found=replace(record.found, expected_mm=0.0, stated_mm=None))
-    assert "No verification tells a change" in health_svg([silent])
+    assert "No verification shows a change" in health_svg([silent])
     assert "Change since calibration" not in health_svg([silent])
-    assert "No verification tells a change" not in health_svg([silent, record])
+    assert "No verification shows a change" not in health_svg([silent, record])
