@@ -53,7 +53,7 @@ _MIN_CONTRAST_SNR = 6.0  # no pixel exceeds it by chance
 
 _SETTLE_S = 0.1  # in addition to the declared and the measured latency
 _MAX_DARK_FRAMES = 64  # a limit in case the times of frames do not advance
-_STAYS_DARK_FRAMES = 3  # that a dark projector is looked at again
+_STAYS_DARK_FRAMES = 3  # after which a dark projector is checked again
 _REFERENCE_FRAMES = 3  # of white and of black; the last two give the noise
 
 
@@ -301,7 +301,7 @@ class ArmedCamera:
             self.camera.trigger()
 
     def read(self, after_ns: int) -> Frame:
-        """Return the next frame whose exposure lies after an instant."""
+        """Return the next frame with its exposure after an instant."""
         frame = self.camera.read(after_ns, self.timeout_s)
         self.bench.remember_instant(frame.t_end_ns)
         return frame

@@ -25,7 +25,7 @@ from slrig.patterns import encode
 _INFO = "read the device once, when it is opened, and keep info in the driver's memory"
 
 _ANOTHER_CLOCK_NS = 60 * 10**9
-"""Times that are further apart are from different clocks: a recording may have one that stands still."""
+"""Times that are further apart are from different clocks: a recording may have one that does not advance."""
 
 _LATE_S = 0.05  # in addition to the declared latency, for a busy machine
 

@@ -48,7 +48,7 @@ def every_end_of_a_capture_is_dark_and_leaves_the_rig_usable(bench: RigBench) ->
         taken: list[object] = []
         with suppress(ScanCancelledError):
             for shot in capture(rig, bench.short_sequence, cancelled=lambda: bool(taken)):
-                taken.append(shot)  # noqa: PERF402 - `cancelled` looks at what was taken so far
+                taken.append(shot)  # noqa: PERF402 - `cancelled` reads what was taken so far
         _expect_left_dark(bench, "a capture that is cancelled after its first frame")
         expect(
             list(capture(rig, bench.short_sequence)),
@@ -316,7 +316,7 @@ def the_projector_is_dark_unless_it_shows(bench: RigBench) -> None:
             armed.expect_level(
                 armed.expose(0),
                 0,
-                expected="a shown white pattern is seen white",
+                expected="a shown white pattern appears white",
                 remedy="light the pattern that is shown",
             )
             darken()

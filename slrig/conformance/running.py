@@ -133,8 +133,8 @@ def run_checks(
     """Examine a rig by every check.
 
     open_rig : opens the rig; called several times, each time after the rig was closed. sequence : patterns that its
-    projector can show, white and black first. listener : is told before and after each check, in the caller's thread,
-    where it may have the examination end. limit_s : time limit of a check; None is a minute, and more for long
+    projector can show, white and black first. listener : is called before and after each check, in the caller's thread,
+    where it may end the examination. limit_s : time limit of a check; None is a minute, and more for long
     exposures. calls : see `ConformanceRun`. found : called before each check with the report as it is if that check
     does not return.
     Raises the errors of opening the rig for the first time.
@@ -173,8 +173,8 @@ class ConformanceRun:
 
     The devices belong to one thread. A check that does not return blocks that thread: no further call is made to the
     devices, and `stopped` gives the reason. If the check returns later, the rig is closed then.
-    calls : of a service whose watchdog ends what hangs: the caller's thread owns the devices then. None starts a thread
-    of its own.
+    calls : of a service with a watchdog that ends hanging calls: the caller's thread owns the devices then. None starts
+    a thread of its own.
     """
 
     def __init__(

@@ -1,1 +1,1 @@
-"""What the HTML reports have in common."""
+"""Common parts of the HTML reports."""

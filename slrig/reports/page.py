@@ -2,7 +2,7 @@
 they are `Markup`.
 
 A page holds everything that it shows: style, drawings and pictures (JPEG). It runs no script and requests nothing, so
-that it can be mailed, printed and kept beside its subject.
+that it can be mailed, printed and kept next to its subject.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ def filled(template: str, /, **values: object) -> str:
     return _TEMPLATES.get_template(template).render(values)
 
 
-def begun(words: str) -> str:
-    """Words as the beginning of a sentence: unlike `str.capitalize`, it leaves the others as they are.
+def begun(text: str) -> str:
+    """A text as the beginning of a sentence: unlike `str.capitalize`, it changes the first letter only.
 
     >>> begun("camera 'B' moved")
     "Camera 'B' moved"
     """
-    return words[:1].upper() + words[1:]
+    return text[:1].upper() + text[1:]
 
 
 _TEMPLATES.filters["begun"] = begun
@@ -65,7 +65,7 @@ WIDTH = 360.0
 _STOPS = np.array(
     [(23, 44, 82), (24, 86, 122), (28, 132, 138), (82, 178, 127), (176, 211, 94), (250, 226, 88)], dtype=np.float64
 )
-"""A ramp from dark blue to yellow whose lightness rises steadily, so that it prints and everyone can read it."""
+"""A ramp from dark blue to yellow of steadily rising lightness: it prints, and everyone can read it."""
 
 
 def shape(name: str, /, *inside: str, **attributes: str | float) -> Markup:
@@ -85,11 +85,11 @@ def shape(name: str, /, *inside: str, **attributes: str | float) -> Markup:
     return Markup("<{0}{1}>{2}</{0}>").format(name, written, Markup("").join(inside))
 
 
-def drawing(width: float, height: float, words: str, parts: Iterable[str], *, class_: str = "chart") -> Markup:
-    """A picture with words for those who cannot see it."""
+def drawing(width: float, height: float, title: str, parts: Iterable[str], *, class_: str = "chart") -> Markup:
+    """A picture with a title for those who cannot see it."""
     box = f"0 0 {width:.6g} {height:.6g}"
     address = "http://www.w3.org/2000/svg"
-    return shape("svg", *parts, class_=class_, viewBox=box, role="img", aria_label=words, xmlns=address)
+    return shape("svg", *parts, class_=class_, viewBox=box, role="img", aria_label=title, xmlns=address)
 
 
 def polygon(points: FloatArray, class_: str) -> Markup:
@@ -124,7 +124,7 @@ def ink_on(share: float) -> str:
 
 
 def legend(least: float, most: float, unit: str) -> Markup:
-    """A bar of the ramp with the values at its ends, and their unit in words beside it."""
+    """A bar of the ramp with the values at its ends, and their unit next to it."""
     steps, width = 24, 150.0
     wide = width / steps
     bars = [
@@ -136,8 +136,8 @@ def legend(least: float, most: float, unit: str) -> Markup:
         shape("text", f"{most:.3g}", x=width, y=22, class_="tick end"),
         shape("text", unit, x=width + 8, y=9, class_="tick"),
     ]
-    words = f"colours from {least:.3g} to {most:.3g} {unit}"
-    return drawing(1.9 * width, 26.0, words, [*bars, *ends], class_="legend")
+    title = f"colours from {least:.3g} to {most:.3g} {unit}"
+    return drawing(1.9 * width, 26.0, title, [*bars, *ends], class_="legend")
 
 
 TREND_WIDTH = 760.0
@@ -152,22 +152,22 @@ _STYLE = (
 )
 
 Moments = Sequence[datetime]
-"""Of what is drawn, oldest first."""
+"""Moments of the drawn values, oldest first."""
 
 
-def trend(words: str, height: float, parts: Sequence[str]) -> Markup:
+def trend(title: str, height: float, parts: Sequence[str]) -> Markup:
     """The whole picture."""
     back = shape("rect", width=TREND_WIDTH, height=height, fill="#ffffff")
-    return drawing(TREND_WIDTH, height, words, [shape("style", _STYLE), back, *parts])
+    return drawing(TREND_WIDTH, height, title, [shape("style", _STYLE), back, *parts])
 
 
-def nothing_yet(words: str) -> Markup:
-    """A picture of these words, where there is nothing to draw."""
+def nothing_yet(text: str) -> Markup:
+    """A picture of a text, where there is nothing to draw."""
     return drawing(
         TREND_WIDTH,
         120,
-        words,
-        [shape("style", _STYLE), shape("text", words, x=TREND_WIDTH / 2, y=60, class_="middle")],
+        text,
+        [shape("style", _STYLE), shape("text", text, x=TREND_WIDTH / 2, y=60, class_="middle")],
     )
 
 
@@ -176,7 +176,7 @@ def _span(moments: Moments) -> timedelta:
 
 
 def x_of(moments: Moments, at: datetime) -> float:
-    """Where a moment is."""
+    """Abscissa of a moment."""
     return LEFT + (END - LEFT) * ((at - moments[0]) / _span(moments))
 
 
@@ -199,7 +199,7 @@ def times(moments: Moments, y: float) -> list[Markup]:
 
 
 class Panel:
-    """A panel with a vertical axis from 0. Values are one for each moment, None where it tells none."""
+    """A panel with a vertical axis from 0. Values are one for each moment, None without one."""
 
     def __init__(self, moments: Moments, top: float, most: float, title: str) -> None:
         self._moments, self._top = moments, top
@@ -214,12 +214,12 @@ class Panel:
     def _y(self, value: float) -> float:
         return self._top + PANEL * (1 - min(max(value / self._most, 0.0), 1.0))
 
-    def limit(self, value: float, words: str, colour: str) -> None:
-        """A dashed line with its name beside it, unless it lies above the panel."""
+    def limit(self, value: float, label: str, colour: str) -> None:
+        """A dashed line with its name next to it, unless it lies above the panel."""
         if value <= self._most:
             y = self._y(value)
             self.parts.append(shape("path", d=f"M{LEFT} {y:.1f}H{END}", stroke=colour, stroke_dasharray="6 4"))
-            self.parts.append(shape("text", words, x=END + 6, y=y + 4, fill=colour))
+            self.parts.append(shape("text", label, x=END + 6, y=y + 4, fill=colour))
 
     def line(self, values: Sequence[float | None], colour: str, *, of: Sequence[str], wide: float = 1.6) -> None:
         """A line through values; a gap begins a new one, and so does a value that is `of` something else."""
@@ -237,10 +237,10 @@ class Panel:
         x, low, high = x_of(self._moments, at), self._y(value - sigma), self._y(value + sigma)
         self.parts.append(shape("path", d=f"M{x:.1f} {low:.1f}V{high:.1f}", stroke=colour))
 
-    def dot(self, at: datetime, value: float, colour: str, words: str) -> None:
-        """A dot at a value, and words that show where a pointer rests on it."""
-        told, x = shape("title", f"{at:%d %b %H:%M}: {words}"), x_of(self._moments, at)
-        self.parts.append(shape("circle", told, cx=x, cy=self._y(value), r=3.2, fill=colour))
+    def dot(self, at: datetime, value: float, colour: str, text: str) -> None:
+        """A dot at a value, and a text that is shown under a pointer."""
+        title, x = shape("title", f"{at:%d %b %H:%M}: {text}"), x_of(self._moments, at)
+        self.parts.append(shape("circle", title, cx=x, cy=self._y(value), r=3.2, fill=colour))
 
 
 def _round_step(step: float) -> float:
