@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 KEY_VARIABLE = "SLRIG_API_KEY"
-"""Where a client keeps its key, and where a service may be given one instead of making its own."""
+"""Environment variable with the key of a client; a service with it uses that key instead of making its own."""
 
 
 def data_home() -> Path:

@@ -53,7 +53,7 @@ from slrig.errors import (
     RigBusyError,
     SlrigError,
     WrongSystemError,
-    asks_to_end,
+    is_interrupt,
 )
 from slrig.model import Calibration, require_plausible
 from slrig.printable import foreign_text
@@ -84,7 +84,7 @@ class InstalledDriver:
 
 @dataclass(frozen=True, slots=True)
 class MissingLibrary:
-    """Driver that cannot look for its devices until the command `install` has been run."""
+    """Driver that cannot find its devices until the command `install` has been run."""
 
     driver: str
     install: str
@@ -128,7 +128,7 @@ def installed_drivers() -> tuple[InstalledDriver, ...]:
 
 
 def discover_devices() -> DiscoveredDevices:
-    """Ask every installed finder for the connected devices; a finder that fails does not affect others."""
+    """Run every installed finder of connected devices; a finder that fails does not affect others."""
     devices: list[FoundDevice] = []
     missing: list[MissingLibrary] = []
     faults: list[DriverBrokenError] = []
@@ -141,28 +141,28 @@ def discover_devices() -> DiscoveredDevices:
         except WrongSystemError as error:
             elsewhere.append(OtherSystem(entry.name, foreign_text(error)))
         except SlrigError as error:
-            told = foreign_text(error)
-            named = isinstance(error, DriverBrokenError) and entry.name in told
-            faults.append(DriverBrokenError(told if named else f"finder '{entry.name}' failed: {told}"))
+            text = foreign_text(error)
+            named = isinstance(error, DriverBrokenError) and entry.name in text
+            faults.append(DriverBrokenError(text if named else f"finder '{entry.name}' failed: {text}"))
     return DiscoveredDevices(tuple(devices), tuple(missing), tuple(faults), tuple(elsewhere))
 
 
 FINDER_LIMIT_S = 30.0
-"""How long a finder may look. One that takes longer is not waited for, nor asked again before it has returned."""
+"""Time limit of a finder. After it the search goes on without it; it is not called again before it has returned."""
 
 _MAX_FOUND = 1000
 """Devices of one finder; more is a finder that does not end."""
 
 _looking: dict[str, threading.Thread] = {}
-"""Finders that have not returned, by their names."""
+"""Threads of finders that have not returned, by their names."""
 
 
 def _found_by(entry: importlib.metadata.EntryPoint) -> tuple[FoundDevice, ...]:
-    """Devices of one finder, which looks on a thread of its own. Raises what it raises; DriverBrokenError: it hangs."""
+    """Devices of one finder, on a thread of its own. Raises its errors; DriverBrokenError: it hangs."""
     finder = _load("finder", entry)
     found: list[tuple[FoundDevice, ...] | SlrigError] = []
 
-    def look() -> None:
+    def search() -> None:
         try:
             with _convert_driver_errors(f"finder driver '{entry.name}'", {}):
                 found.append(tuple(require_found(each) for each in islice(finder(), _MAX_FOUND)))
@@ -171,7 +171,7 @@ def _found_by(entry: importlib.metadata.EntryPoint) -> tuple[FoundDevice, ...]:
 
     before = _looking.get(entry.name)
     if before is None or not before.is_alive():
-        before = _looking[entry.name] = threading.Thread(target=look, name=f"slrig-finder {entry.name}", daemon=True)
+        before = _looking[entry.name] = threading.Thread(target=search, name=f"slrig-finder {entry.name}", daemon=True)
         before.start()
         before.join(FINDER_LIMIT_S)
     if not found:
@@ -187,13 +187,13 @@ def _found_by(entry: importlib.metadata.EntryPoint) -> tuple[FoundDevice, ...]:
 
 
 class DeviceSearch:
-    """The search for devices, which touches hardware. Whoever calls sees to it that one is made at a time."""
+    """The search for devices, which touches hardware. Callers make one at a time."""
 
     def __init__(self) -> None:
         self._found: DiscoveredDevices | None = None
 
     def found(self, holder: str | None) -> DiscoveredDevices:
-        """What is plugged in. holder : who holds the rig; the last result stands meanwhile.
+        """The connected devices. holder : of the rig; while it is held, the last result is returned.
 
         Raises RigBusyError: the rig is held, and no search was made before.
         """
@@ -201,7 +201,7 @@ class DeviceSearch:
             self._found = discover_devices()
         if self._found is None:
             message = (
-                f"The rig is held by {holder}, and a search for devices would disturb it. Ask again when that is over."
+                f"The rig is held by {holder}, and a search for devices would disturb it. Try again when that is over."
             )
             raise RigBusyError(message, holder=holder or "", since="")
         return self._found
@@ -381,7 +381,7 @@ def _open(kind: str, table: DriverTable, protocol: type[Any], folder: Path, *nam
             device = factory(*name, table.options, folder)
             if hasattr(device, "close"):
                 opened.callback(_close_quietly, device)
-        # That asks the device for all that it declares.
+        # That reads all declarations of the device.
         with _convert_driver_errors(label, table.options, " in info"):
             if not isinstance(device, protocol):
                 raise DriverBrokenError(
@@ -410,7 +410,7 @@ def _load(kind: str, entry: importlib.metadata.EntryPoint) -> Callable[..., Any]
     try:
         factory = entry.load()
     except BaseException as cause:  # importing a package must not end the service
-        if asks_to_end(cause):
+        if is_interrupt(cause):
             raise
         raise DriverBrokenError(
             f"{kind} driver '{entry.name}' of {package} {version} cannot be loaded ({entry.value}): "
@@ -447,10 +447,10 @@ def _convert_driver_errors(label: str, options: Mapping[str, object], doing: str
         message = f"{label} refuses these options:\n{describe_errors(cause, options, {})}"
         raise ConfigError(message) from cause
     except BaseException as cause:
-        if asks_to_end(cause):
+        if is_interrupt(cause):
             raise
-        told = f"{type(cause).__name__}: {foreign_text(cause)}"
-        message = f"{label} failed{doing}: {told}; report it to the driver's package"
+        text = f"{type(cause).__name__}: {foreign_text(cause)}"
+        message = f"{label} failed{doing}: {text}; report it to the driver's package"
         raise DriverBrokenError(message) from cause
 
 
@@ -493,7 +493,7 @@ def option_model(driver: str) -> type[BaseModel] | None:
     try:
         model: object = entries[0].load()
     except BaseException as cause:  # importing a package must not end the command
-        if asks_to_end(cause):
+        if is_interrupt(cause):
             raise
         message = (
             f"the options of driver '{driver}' of {packages} cannot be loaded ({entries[0].value}): "

@@ -39,7 +39,7 @@ def staging_name(path: Path) -> Path:
 
 
 def prepare_kernel_cache(folder: Path) -> None:
-    """Tell numba where to keep compiled kernels when slrig's own folder is read-only; call before numba is loaded.
+    """Set numba's folder of compiled kernels when slrig's own folder is read-only; call before numba is loaded.
 
     numba itself refuses to load a cached kernel when it finds no place to write, as under systemd or in a container.
     """

@@ -1,6 +1,6 @@
 """All errors that slrig raises on purpose, in one tree.
 
-A message says what was requested, what was found, and what to do, in its reader's words. Status codes and exit codes
+A message says what was requested, what was found, and what to do, in its reader's terms. Status codes and exit codes
 are decided at the edges (`slrig.api.problems`, `slrig.cli`), never here.
 """
 
@@ -33,7 +33,7 @@ def setting(name: str) -> str:
     return f"{name} (--{_FLAGS.get(name, name.replace('_', '-'))})"
 
 
-def asks_to_end(error: BaseException) -> bool:
+def is_interrupt(error: BaseException) -> bool:
     """Whether an error is Ctrl-C, which ends a command and comes on its main thread, and not one of foreign code."""
     return isinstance(error, KeyboardInterrupt) and threading.current_thread() is threading.main_thread()
 
@@ -55,7 +55,7 @@ class SlrigError(Exception):
 
 @contextmanager
 def of_camera(name: str) -> Iterator[None]:
-    """Have errors of the block say which camera failed."""
+    """Name the camera that failed in errors of the block."""
     try:
         yield
     except SlrigError as error:
@@ -177,7 +177,7 @@ class QueueFullError(SlrigError, code="queue-full"):
 
 
 class ScanCancelledError(SlrigError, code="scan-cancelled"):
-    """Somebody cancelled this scan. Not a failure."""
+    """This scan was cancelled. Not a failure."""
 
 
 class CameraNotFoundError(SlrigError, code="camera-not-found"):
@@ -245,7 +245,7 @@ class LiveStateError(SlrigError, code="live-state"):
 
 
 class RigFileChangedError(SlrigError, code="rig-file-changed"):
-    """The rig file is not the one that a change was made of: somebody else changed it meanwhile. Nothing is lost."""
+    """The rig file is not the one that a change was made of: it was changed meanwhile. Nothing is lost."""
 
 
 class IdempotencyError(SlrigError, code="idempotency"):
@@ -279,7 +279,7 @@ class ExtraMissingError(SlrigError, code="extra-missing"):
 
 
 class WorkerBusyError(SlrigError, code="worker-busy"):
-    """The process that computes has other work, or is not ready yet, and an answer would take too long. Ask again
+    """The process that computes has other work, or is not ready yet, and an answer would take too long. Try again
     later.
     """
 

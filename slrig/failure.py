@@ -53,7 +53,7 @@ def errors_by_code() -> dict[str, type[SlrigError]]:
 
 
 def error_of(fault: JobFailure) -> SlrigError:
-    """The error that a recorded fault stands for.
+    """The error of a recorded fault.
 
     >>> error_of(JobFailure("pose-refused", "no camera sees the board"))
     PoseRefusedError('no camera sees the board')
@@ -64,7 +64,7 @@ def error_of(fault: JobFailure) -> SlrigError:
 
 
 def job_failure(error: BaseException) -> JobFailure:
-    """Return the failure that stands for an exception.
+    """Return the failure of an exception.
 
     >>> job_failure(StorageError("The disk is full.")).code
     'storage'
@@ -85,12 +85,12 @@ def job_failure(error: BaseException) -> JobFailure:
 
 
 def interruption_error() -> ScanInterruptedError:
-    """Return the error that stands for a job that ended with the service."""
+    """Return the error of a job that ended with the service."""
     return ScanInterruptedError("The service ended while this was under way. Start it again.")
 
 
 def disk_error_message(error: OSError, path: Path | None) -> str:
-    """Return the message for a person whose disk refused a write."""
+    """Return the message about a disk that refused a write."""
     where = error.filename or path or "the data folder"
     reason = error.strerror or str(error)
     remedy = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "check the disk and its permissions"
@@ -108,13 +108,13 @@ def disk_errors(path: Path) -> Iterator[None]:
         raise StorageError(disk_error_message(error, path)) from error
 
 
-_BEGIN_ANEW_S = 1.0
+_RESTART_S = 1.0
 
 _log = structlog.get_logger(__name__)
 
 
 class LastingThread(threading.Thread):
-    """A thread that lasts as long as a service. An error that ends its loop is logged, and the loop begun anew."""
+    """A thread that lasts as long as a service. An error that ends its loop is logged, and the loop restarted."""
 
     def __init__(self, loop: Callable[[], None], name: str) -> None:
         super().__init__(name=name, daemon=True)
@@ -125,13 +125,13 @@ class LastingThread(threading.Thread):
         while True:
             try:
                 return self._loop()
-            except BaseException:  # noqa: BLE001 - whatever it is: work waits for this loop
-                _log.exception("a loop ended by an error, and is begun anew", thread=self.name)
-                time.sleep(_BEGIN_ANEW_S)
+            except BaseException:  # noqa: BLE001 - after any error: work waits for this loop
+                _log.exception("a loop ended by an error, and is restarted", thread=self.name)
+                time.sleep(_RESTART_S)
 
 
 def as_error(raised: BaseException) -> Exception:
-    """What ended a job, as an error: the service's threads do not end by what a job raises, SystemExit among it."""
+    """The end of a job as an error: no exception of a job, not even SystemExit, ends the service's threads."""
     if isinstance(raised, Exception):
         return raised
     error = RuntimeError(f"{type(raised).__name__} ended it")

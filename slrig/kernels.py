@@ -1,8 +1,8 @@
 """Compiled kernels: compilation, cache, count, and execution on all cores.
 
 numba compiles a kernel on its first call, and keeps it on disk. A wheel for one platform brings kernels along
-(config/deploy/wheel.py makes it): an archive for each of two levels of x86-64, whose members are named as the files of
-the cache are, by all that went into them. All kernels are compiled for the level of the processor, not for its model,
+(config/deploy/wheel.py makes it): an archive for each of two levels of x86-64, with members named like the files of
+the cache, by all that went into them. All kernels are compiled for the level of the processor, not for its model,
 so that one machine's kernels run on others. A kernel runs on one core and releases the
 interpreter's lock; `in_bands` calls one for bands of rows on all cores at once. numba's own parallel loops are not
 used: they take three to four times as long to compile, do not compile everywhere (numba 0.68 on Python 3.12 and 3.13
@@ -60,14 +60,14 @@ def best_cpu_level() -> str | None:
         return "generic"
     try:
         features = llvmlite.binding.get_host_cpu_features()
-    except RuntimeError:  # LLVM cannot tell
+    except RuntimeError:  # not known to LLVM
         return None
     has = {name for name, there in features.items() if there}
     return next((level for level, needed in CPU_LEVELS.items() if needed <= has), None)
 
 
 def _choose_cpu_level() -> None:
-    """Have numba compile for the level, unless NUMBA_CPU_NAME says otherwise. In the environment, because numba reads
+    """Make numba compile for the level, unless NUMBA_CPU_NAME says otherwise. In the environment, because numba reads
     that again when another of its variables changes; child processes inherit it.
     """
     level = best_cpu_level()
@@ -229,7 +229,7 @@ class _KernelCache(FunctionCache):  # type: ignore[misc] # numba is untyped
     """numba's cache with files that two processes may write at once, and that depend on the sources of a kernel's
     parts.
 
-    It looks for its folder on the first use: of two hundred kernels and parts that are loaded a run calls a few.
+    It searches its folder on the first use: of two hundred kernels and parts that are loaded a run calls a few.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -320,7 +320,7 @@ class _Shipped(NamedTuple):
         if self.archive is None or name not in self.names:
             return None
         try:
-            return pickle.loads(self.archive.read(name))  # noqa: S301 - as trustworthy as the code beside it
+            return pickle.loads(self.archive.read(name))  # noqa: S301 - as trustworthy as the code next to it
         except (OSError, EOFError, zipfile.BadZipFile, zlib.error, pickle.UnpicklingError) as error:
             _log.warning("a compiled kernel of slrig's cannot be read; reinstall slrig", name=name, cause=str(error))
             return None
@@ -344,8 +344,8 @@ def _digest(value: object) -> str:
 
 
 def _sources(function: Callable[..., Any], visited: set[Callable[..., Any]]) -> set[tuple[str, str]]:
-    """What a kernel and the parts that it calls are compiled from: names and digests of their files, and the constants
-    that they take from others.
+    """Sources of a kernel and the parts that it calls: names and digests of their files, and the constants that they
+    take from others.
     """
     visited.add(function)
     file = Path(function.__code__.co_filename)

@@ -1,4 +1,4 @@
-"""What packages add to slrig by entry points. slrig's own additions are in `slrig.extras`; nothing else imports them.
+"""Entry points by which packages extend slrig. slrig's own are in `slrig.extras`; nothing else imports them.
 
 | group | name of the entry | object |
 |---|---|---|
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from slrig.errors import ConfigError, DriverBrokenError, SlrigError, asks_to_end
+from slrig.errors import ConfigError, DriverBrokenError, SlrigError, is_interrupt
 from slrig.printable import foreign_text
 
 FORMATS, RECEIVERS, OBSERVERS = "slrig.formats", "slrig.receivers", "slrig.observers"
@@ -72,7 +72,7 @@ class FileFormat:
         except SlrigError:
             raise
         except BaseException as error:
-            if asks_to_end(error):
+            if is_interrupt(error):
                 raise
             message = (
                 f"{self.name}: its encoder {self.encoder} failed ({type(error).__name__}: {foreign_text(error)}); "
@@ -104,13 +104,13 @@ def load(group: str) -> Mapping[str, Any]:
 
 @contextmanager
 def plugin_errors(group: str, name: str) -> Iterator[None]:
-    """Have a plug-in that fails within the block be named by a ConfigError. Its own errors of slrig pass."""
+    """Name a plug-in that fails within the block by a ConfigError. Its own errors of slrig pass."""
     try:
         yield
     except SlrigError:
         raise
     except BaseException as error:
-        if asks_to_end(error):
+        if is_interrupt(error):
             raise
         cause = f"{type(error).__name__}: {foreign_text(error)}"
         message = f"{group}: '{name}' cannot be loaded: {cause}. Update or uninstall that package."

@@ -20,7 +20,7 @@ _FOREIGN_LENGTH = 2000
 
 
 def foreign_text(value: object) -> str:
-    r"""Text of an object that somebody else's code made, such as an error: lines and tabs stay, other characters that
+    r"""Text of an object of foreign code, such as an error: lines and tabs stay, other characters that
     affect a terminal are escaped, and it has an end. An object without a text of its own gives its type.
 
     >>> foreign_text(ValueError("a\x1b[2J\ud800\nb"))
@@ -28,7 +28,7 @@ def foreign_text(value: object) -> str:
     """
     try:
         text = str(value)
-    except BaseException:  # noqa: BLE001 - of somebody else's class
+    except BaseException:  # noqa: BLE001 - of a foreign class
         text = type(value).__name__
     lines = [[printable(part) for part in line.split("\t")] for line in text[: _FOREIGN_LENGTH + 1].split("\n")]
     found = "\n".join("\t".join(parts) for parts in lines)

@@ -1,6 +1,6 @@
 """ROS 2 messages of a scan: their contents, for the message classes of any library.
 
-The bag is made with rosbags' classes, and what the node publishes with ROS's own; both take fields by name. Lengths are
+The bag is made with rosbags' classes, and the node's messages with ROS's own; both take fields by name. Lengths are
 metres (REP 103). A device's frame is called NAME_optical_frame, and its axes are those of ROS's optical frames, which
 are slrig's own: x right, y down, z ahead.
 """
@@ -61,7 +61,7 @@ class Points(Protocol):
 
 
 def topic(name: str, what: str, *, under: str = "/slrig") -> str:
-    """Where the messages of a device are published. ROS's names hold no hyphens, and begin with no digit.
+    """Topic of a device's messages. ROS's names hold no hyphens, and do not begin with a digit.
 
     >>> topic("left-2", "points"), topic("2nd", "points", under="~")
     ('/slrig/left_2/points', '~/_2nd/points')
@@ -84,13 +84,13 @@ def point_table(cloud: Points, *, units_per_mm: float = 1.0) -> NDArray[np.float
 
 
 def lens(matrix: Floats, distortion: Floats) -> dict[str, Any]:
-    """The fields of a CameraInfo that say how a device sees. It is not rectified: r is no turn, and p is k."""
+    """The fields of a CameraInfo of a device's optics. It is not rectified: r is no turn, and p is k."""
     straight = np.hstack([matrix, np.zeros((3, 1))])
     return {"distortion_model": "plumb_bob", "d": distortion, "k": matrix, "r": np.eye(3), "p": straight}
 
 
 def pose(rotation: Floats, translation_mm: Floats) -> tuple[list[float], list[float]]:
-    """Where a device stands in the world: its centre, m, and the turn from its axes to the world's, (x, y, z, w).
+    """Pose of a device in the world: its centre, m, and the turn from its axes to the world's, (x, y, z, w).
 
     The quaternion is the direction of 4 q qᵀ (Bar-Itzhack 2000), which the turn's matrix gives.
     """
@@ -191,7 +191,7 @@ class Messages:
         )
 
     def transforms(self, devices: Mapping[str, Device], robot: tuple[str, Floats] | None = None) -> Any:
-        """tf2_msgs/msg/TFMessage for /tf_static: where each device stands in the world. robot : a frame of a robot, and
+        """tf2_msgs/msg/TFMessage for /tf_static: the pose of each device in the world. robot : a frame of a robot, and
         the pose of the world in it, (4, 4), mm.
         """
         made = [
@@ -199,9 +199,9 @@ class Messages:
             for name, device in devices.items()
         ]
         if robot is not None:
-            frame, placed = robot
-            back = placed[:3, :3].T
-            made.append(self._transform(frame, self.world, back, -back @ placed[:3, 3]))
+            frame, world_pose = robot
+            back = world_pose[:3, :3].T
+            made.append(self._transform(frame, self.world, back, -back @ world_pose[:3, 3]))
         return self.class_of("tf2_msgs/msg/TFMessage")(transforms=made)
 
     def _transform(self, parent: str, child: str, rotation: Floats, translation_mm: Floats) -> Any:

@@ -211,7 +211,7 @@ def test_watchdog_barks_once_for_each_call_that_hangs() -> None:
 
 
 def test_a_loop_that_an_error_ends_is_begun_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(failure, "_BEGIN_ANEW_S", 0.0)
+    monkeypatch.setattr(failure, "_RESTART_S", 0.0)
     begun: list[int] = []
 
     def loop() -> None:
@@ -225,7 +225,7 @@ def test_a_loop_that_an_error_ends_is_begun_anew(monkeypatch: pytest.MonkeyPatch
         thread.join(WAIT_S)
     assert (thread.is_alive(), thread.daemon, len(begun)) == (False, True, 4)
     assert [(line["event"], line["thread"]) for line in logs] == [
-        ("a loop ended by an error, and is begun anew", "slrig-test")
+        ("a loop ended by an error, and is restarted", "slrig-test")
     ] * 3
 
 
