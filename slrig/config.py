@@ -275,7 +275,7 @@ class ServiceSettings(BaseModel):
     with the user and password of `mqtt_login` or `mqtt_login_file`. Without an address nothing is sent. Nothing is
     removed unless a setting sets a limit: `keep_calibrations`, `keep_models`, `keep_scans` (their numbers),
     `keep_scans_days`, `keep_scans_bytes`. Beyond it the oldest are removed, failed ones first and counted apart, except
-    pinned ones, those whose files were requested in the last quarter of an hour, and calibrations that are in use or
+    pinned ones, those with files requested in the last quarter of an hour, and calibrations that are in use or
     that a scan or an acceptance test names. They lie in `.trash` of the data folder for a day. `backlog_length` is the
     number of scans
     that may be reconstructed, or wait for that, while the rig captures the next one; other computations count too.

@@ -363,7 +363,7 @@ def _sources(function: Callable[..., Any], visited: set[Callable[..., Any]]) -> 
 
 
 def _names(code: CodeType) -> Iterator[str]:
-    """Names that a function and those within it look up outside."""
+    """Names that a function and those within it take from outside."""
     yield from code.co_names
     for constant in code.co_consts:
         if isinstance(constant, CodeType):

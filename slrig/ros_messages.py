@@ -84,7 +84,7 @@ def point_table(cloud: Points, *, units_per_mm: float = 1.0) -> NDArray[np.float
 
 
 def lens(matrix: Floats, distortion: Floats) -> dict[str, Any]:
-    """The fields of a CameraInfo of a device's optics. It is not rectified: r is no turn, and p is k."""
+    """The fields of a CameraInfo of a device's optics. It is not rectified: r is the identity, and p is k."""
     straight = np.hstack([matrix, np.zeros((3, 1))])
     return {"distortion_model": "plumb_bob", "d": distortion, "k": matrix, "r": np.eye(3), "p": straight}
 

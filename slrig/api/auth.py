@@ -319,7 +319,7 @@ class Sessions:
         oldest ends for this one. Raises HTTPException 429: it has none, and others have all.
         """
         now = self._clock()
-        # In their order, and without those of keys that have ended; a key is looked up once.
+        # In their order, and without those of keys that have ended; each key is read once.
         good = {key: self._good(key, now) for key in {session.key for session in self._open.values()}}
         self._open = {
             each: session for each, session in self._open.items() if good[session.key] and session.expires_at > now

@@ -175,7 +175,7 @@ _EVERYTHING = _answers(
     ],
 )
 _JOB = _answers(
-    "`progress` events with stage, fraction and detail; `captured` when the rig is free of the job, whose "
+    "`progress` events with stage, fraction and detail; `captured` when the rig is free of the job: its "
     "frames are written to disk and reconstructed then; `file` events with the name of a file that can be fetched from "
     "then on; `state` events with the new state. The stream ends after the event of a final state. Jobs that are "
     "long over have no `progress`.",

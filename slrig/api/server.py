@@ -185,15 +185,15 @@ class HttpConnection(H11Protocol):
         """See `asyncio.Protocol`."""
         super().data_received(data)
         if not self.transport.is_closing():
-            self._look(begun=True)
+            self._check_deadline(begun=True)
 
     def on_response_complete(self) -> None:
         """See `H11Protocol`."""
         super().on_response_complete()
         if not self.transport.is_closing():
-            self._look(begun=False)
+            self._check_deadline(begun=False)
 
-    def _look(self, *, begun: bool) -> None:
+    def _check_deadline(self, *, begun: bool) -> None:
         """See what the client owes now. begun : it has sent something; else an idle connection owes no head yet."""
         if self.conn.their_state is h11.SEND_BODY:
             self._await("body")

@@ -193,7 +193,7 @@ def add(
 ) -> None:
     """Make a key, and show it once.
 
-    A running service takes it at once. Scopes: look reads everything, scan scans and looks through cameras, calibrate
+    A running service takes it at once. Scopes: look reads everything, scan scans and previews cameras, calibrate
     also shoots poses, solves, verifies and tests, administer schedules and reads the audit record.
     """
     from slrig.api.scopes import KeyScope

@@ -224,8 +224,8 @@ def _devices(calibration: Mapping[str, Any]) -> dict[str, Device]:
 
 
 def _robot(client: Client, calibration: str | None) -> tuple[str, NDArray[np.float64]] | None:
-    """The robot's frame in which the service knows its rig by hand-eye calibration, and the rig's pose in it, (4, 4),
-    mm; None where it does not. calibration : identifier of the scan's, in whose frame the points are, if it has one.
+    """The robot's frame with the rig's hand-eye calibration, and the rig's pose in it, (4, 4), mm; None without one.
+    calibration : identifier of the scan's, for the frame of the points, if it has one.
     """
     try:
         found = client.hand_eye.get()

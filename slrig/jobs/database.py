@@ -396,7 +396,7 @@ class Database:
 
     @contextmanager
     def changing(self, *, passing: bool = False) -> Iterator[Session]:
-        """A session whose changes are kept, all of them, when the block ends without an error.
+        """A session; its changes are committed, all of them, when the block ends without an error.
 
         passing : a change that a power cut may undo, as how far a job is: it reaches the disk with the next one that is
         to last, and is refused where another program has the file locked. A slow disk takes 10 ms and more to sync.

@@ -205,7 +205,7 @@ class FedCaptures:
 
 
 class Recording(Protocol):
-    """A bundle whose frames have all been taken, and may still be on their way to the disk."""
+    """A bundle with all frames taken, which may still be on their way to the disk."""
 
     def finish(self) -> None:
         """Bring the bundle to its place. Raises StorageError."""
@@ -265,7 +265,7 @@ class JobRun(Listener):
 
 
 class Job:
-    """One kind of work: a frozen dataclass whose fields are its plan. It is sent to the worker, and holds data alone.
+    """One kind of work: a frozen dataclass; its fields are its plan. It is sent to the worker, and holds data alone.
 
     uses_rig : whether it captures. computes : whether anything is left to do when the rig is free. feeds : whether the
     worker takes frames while they are captured. keeps_bundle : whether frames are kept where it failed. one_at_a_time :
@@ -300,7 +300,7 @@ class Job:
 
     @property
     def ready(self) -> bool:
-        """False while it cannot be begun, as a model whose views are being shot."""
+        """False while it cannot be begun, as a model before all of its views are shot."""
         return True
 
     @property
@@ -374,8 +374,8 @@ class Group(Protocol):
         ...
 
     def ended(self, job: Job, job_id: UUID, outcome: Outcome | None) -> Outcome:
-        """Take note of a job whose files are in their place; return what is to be on record of it. outcome : None where
-        it came to nothing.
+        """Note a job with its files in their place; return the outcome to record. outcome : None where it came to
+        nothing.
         """
         ...
 

@@ -1,6 +1,6 @@
 """Runs jobs: one at a time with the rig, others compute meanwhile; each job is on record with one end.
 
-A job whose capture is over leaves the rig to the next one. Previews are taken in between.
+A job leaves the rig after its capture the rig to the next one. Previews are taken in between.
 """
 
 from __future__ import annotations
@@ -624,7 +624,7 @@ class JobManager:
             work.outcome = self._kept(work, made)
 
     def _frees_rig(self, work: _Work) -> bool:
-        """Free the rig of a job whose second part is begun. One that was given up while its driver hung is over,
+        """Free the rig of a job once its second part is begun. One that was given up while its driver hung is over,
         although the driver has returned.
         """
         with self._changed:
@@ -766,7 +766,7 @@ class JobManager:
         return ProgressRecorder(self.store, work.id, hidden=hidden, span=(begin, end), attempt=attempt)
 
     def _follow(self, work: _Work) -> None:
-        """Line up the jobs that follow one whose frames are taken."""
+        """Line up the jobs that follow one with all frames taken."""
         group = self.groups.get(work.job.kind)
         if group is not None:
             with _unharmed(work), acting_as(work.by):
@@ -805,7 +805,7 @@ class JobManager:
             self.data.keep_bundle(job_id, place)
 
     def _dismiss(self, work: _Work) -> None:
-        """Tell the group of a job, once, that it came to nothing, and get the worker ready for the next."""
+        """Inform the group of a job, once, that it came to nothing, and get the worker ready for the next."""
         if work.dismissed:
             return
         work.dismissed = True

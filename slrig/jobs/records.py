@@ -148,7 +148,7 @@ class JobState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class JobProgress:
-    """How far a job is: the stage's name, the fraction 0..1 of the whole job, and a detail for people."""
+    """Progress of a job: the stage's name, the fraction 0..1 of the whole job, and a detail for people."""
 
     stage: str
     fraction: float
@@ -335,7 +335,7 @@ UNREADABLE = JobFailure(
     "The record of this job is damaged and cannot be read. Check the disk. If the job's files are whole, the service "
     "rebuilds the record from them at its next start; if not, delete the job.",
 )
-"""The fault of a job whose row cannot be read."""
+"""The fault of a job with an unreadable row."""
 
 _LIBRARIES = ("slrig", "numpy", "numba", "llvmlite", "scipy", "opencv-python-headless")
 _PACKAGE = Path(__file__).resolve().parent.parent

@@ -23,7 +23,7 @@ _log = structlog.get_logger(__name__)
 def resume(manager: JobManager) -> None:
     """End or continue every job that the last run left open. Once, before the manager starts.
 
-    - A job whose files are in their place had only its end missing on record.
+    - A job with its files in their place had only its end missing on record.
     - One that waited waits again. One that computed, or waited for that, is computed from the frames that it has, until
       the worker has begun it `MAX_ATTEMPTS` times: those frames may be what ended the service each time.
     - Any other was interrupted; its frames are kept if it keeps them and all had come.
@@ -117,7 +117,7 @@ def _require_files(manager: JobManager, record: JobRecord) -> None:
 def _restore(manager: JobManager, kind: type[Job], unreadable: set[UUID]) -> None:
     """Put finished jobs on record again, in the order of their making, and other files aside.
 
-    unreadable : jobs whose records make room.
+    unreadable : jobs with records to replace.
     """
     store, data = manager.store, manager.data
     known, found = set(store.states(kind.kind)), list[tuple[JobRecord, Path]]()

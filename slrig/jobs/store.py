@@ -80,7 +80,7 @@ class Copies:
             session.execute(delete(CopyRow).where(CopyRow.number.in_([each.number for each in copies])))
 
     def waiting(self) -> tuple[int, float]:
-        """How many wait, and for how many seconds the oldest does."""
+        """Number of waiting entries, and age of the oldest, s."""
         with self._database.reading() as session:
             count = session.scalar(select(func.count()).select_from(CopyRow)) or 0
             oldest = session.scalar(select(CopyRow.at).order_by(CopyRow.number).limit(1))
@@ -249,7 +249,7 @@ class Outbox:
             session.execute(delete(NoticeRow).where(NoticeRow.number == notice.number))
 
     def waiting(self, receiver: str) -> tuple[int, float]:
-        """How many wait, and for how many seconds the oldest does."""
+        """Number of waiting entries, and age of the oldest, s."""
         query = select(func.count(), func.min(NoticeRow.at)).where(NoticeRow.receiver == receiver)
         with self.database.reading() as session:
             count, oldest = session.execute(query).one()
@@ -476,7 +476,7 @@ class JobStore:
         return {found: state or JobState.FAILED for found, state in rows if found is not None}
 
     def unreadable(self) -> Sequence[JobRecord]:
-        """The jobs whose rows cannot be read; they are in a final state from now on. One without an id is forgotten."""
+        """The jobs with unreadable rows; they are in a final state from now on. One without an id is forgotten."""
         with self.database.changing() as session:
             rows = [row for row in session.scalars(_jobs()) if record_of(row).fault == UNREADABLE]
             for row in rows:

@@ -466,7 +466,7 @@ class Worker:
 
     @property
     def jobs(self) -> int:
-        """How many jobs are under way or wait."""
+        """Number of jobs under way or waiting."""
         with self._turn:
             return len(self._turns)
 

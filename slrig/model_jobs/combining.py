@@ -438,8 +438,8 @@ def _of_model(whole: FusedModel) -> dict[str, Any]:
     """The fused mesh for report.json.
 
     sigma_ends_mm : 5 % and 95 % of its vertices are below. seen_by : share of them by the number of their views. open :
-    its borders, of holes and of parts that no view shows, see `slrig.meshing.topology`. marked : vertices whose
-    colour is in doubt, by cause.
+    its borders, of holes and of parts that no view shows, see `slrig.meshing.topology`. marked : vertices with a
+    colour in doubt, by cause.
     """
     mesh = whole.mesh
     shares = np.bincount(whole.views) / len(whole.views)

@@ -47,7 +47,7 @@ class _LastPosition(BaseModel):
 
 
 class CountedTurntable:
-    """Implements `slrig.devices.Turntable` by another one, whose angles count from its opening.
+    """Implements `slrig.devices.Turntable` by another one with angles that count from its opening.
 
     A table with an unchanged own count continues from its angle. One that turned when the service was killed, or that
     has restarted its count, has angles unrelated to those from before: they are of another `count`. A manual turn of a
