@@ -596,7 +596,7 @@ def pin_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
 
 @router.delete("/{calibration_id}/pin", responses=problems(507))
 def unpin_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
-    """Remove a calibration when it is old, where the settings say so."""
+    """Allow the removal of a calibration when it is old, where the settings say so."""
     return _answered(service, service.calibrations.pin(calibration_id, pinned=False))
 
 

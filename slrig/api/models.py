@@ -191,7 +191,7 @@ def pin_model(service: Serving, model_id: UUID) -> ModelBody:
 
 @router.delete("/{model_id}/pin")
 def unpin_model(service: Serving, model_id: UUID) -> ModelBody:
-    """Remove a model when it is old, where the settings say so."""
+    """Allow the removal of a model when it is old, where the settings say so."""
     return model_body(service, service.store.pin(model_id, JobKind.MODEL, pinned=False))
 
 

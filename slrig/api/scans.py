@@ -167,7 +167,7 @@ def pin_scan(service: Serving, scan_id: UUID) -> ScanBody:
 
 @router.delete("/{scan_id}/pin")
 def unpin_scan(service: Serving, scan_id: UUID) -> ScanBody:
-    """Remove a scan when it is old, where the settings say so."""
+    """Allow the removal of a scan when it is old, where the settings say so."""
     return _body(service, service.store.pin(scan_id, JobKind.SCAN, pinned=False))
 
 

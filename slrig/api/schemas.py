@@ -150,7 +150,7 @@ class ReconstructionRequest(Strict):
     )
     max_code_gap: Annotated[int, Field(ge=1, le=64)] | None = Field(
         default=None,
-        description="stripes that differ by at most this many columns are meshed together. Default 1",
+        description="stripes with columns that differ by at most this many steps are meshed together. Default 1",
     )
     flip_rule: Annotated[FlipRule, Field(strict=False)] | None = Field(
         default=None,
