@@ -112,12 +112,12 @@ async def watch_live(
     held.enter_context(service.streams.take())
     loop, news = asyncio.get_running_loop(), asyncio.Event()
 
-    def told() -> None:
+    def notify() -> None:
         # The loop of a service that ends may be gone before its viewers are.
         with suppress(RuntimeError):
             loop.call_soon_threadsafe(news.set)
 
-    viewer = await run_in_threadpool(service.manager.live.watch, step, told)
+    viewer = await run_in_threadpool(service.manager.live.watch, step, notify)
     return StreamingResponse(_messages(viewer, news), media_type=_TYPE, headers={"Cache-Control": "no-store"})
 
 
@@ -139,7 +139,7 @@ async def _messages(viewer: Viewer, news: asyncio.Event) -> AsyncIterator[bytes]
                 async with asyncio.timeout(_WAIT_S):
                     await news.wait()
             except TimeoutError:
-                # Whoever has gone is noticed by it.
+                # It reveals clients that have gone.
                 yield message({"kind": "wait", "reason": viewer.waits_for}, b"")
 
 

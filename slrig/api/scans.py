@@ -154,9 +154,9 @@ def reconstruct_scan(
     stay until then. Follow `links.events` for the rest.
     """
     record = service.store.get(scan_id, JobKind.SCAN)
-    asked = None if request.uncalibrated is None else with_guess(record, request.uncalibrated.guess())
+    instead = None if request.uncalibrated is None else with_guess(record, request.uncalibrated.guess())
     with service.models.unused(scan_id):
-        return _body(service, service.manager.compute_again(scan_id, asked))
+        return _body(service, service.manager.compute_again(scan_id, instead))
 
 
 @router.put("/{scan_id}/pin")

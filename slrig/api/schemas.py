@@ -473,7 +473,7 @@ def scan_body(record: JobRecord, files: Mapping[str, str]) -> ScanBody:
 
 
 def scan_unit(record: JobRecord) -> str:
-    """Unit of a scan's lengths, also where the record of what was asked is damaged."""
+    """Unit of a scan's lengths, also where the record of the request is damaged."""
     guess = (record.plan.get("reconstruction") or {}).get("uncalibrated")
     return length_unit(None if guess is None else RigGuess(baseline_mm=guess.get("baseline_mm")))
 

@@ -545,7 +545,7 @@ def test_what_waits_for_a_receiver_that_is_no_longer_named_is_dropped_as_late_as
 def test_a_webhook_is_set_tried_and_removed_while_the_service_runs(tmp_path: Path, bench: Bench, hook: Hook) -> None:
     outbox = Outbox(bench.database, rig="bench")
     receivers = Receivers(ServiceSettings(), outbox, tmp_path)
-    with pytest.raises(ConfigError, match="no receiver 'webhook'.*: none"):
+    with pytest.raises(ConfigError, match=r"no receiver 'webhook'.*: none"):
         receivers.get("webhook")
     receivers.start()
     receivers.set_webhook(WebhookEntry(url="http://127.0.0.1:1/elsewhere", kinds=("run.failed",)))
