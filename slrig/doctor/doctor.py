@@ -213,7 +213,7 @@ class _DoctorRun:
             ("timing", self._measure_timing),
             ("picture and focus", self._check_pictures),
             ("response", self._measure_response),
-            # A lens that goes to and fro may be back where it was at one look.
+            # A lens that moves back and forth may be back where it was at one measurement.
             ("steadiness", self._check_steady),
             ("flicker", self._measure_flicker),
             ("exposure", self._advise_exposures),
