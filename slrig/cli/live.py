@@ -64,9 +64,8 @@ def live(
             else:
                 _show(client.live.watch(step), export, seconds)
         except KeyboardInterrupt:
+            # Others may watch; where nobody does, it ends by itself.
             pass
-        finally:
-            client.live.end()
 
 
 def _show(frames: Iterable[LiveFrame], export: Path | None, seconds: float | None) -> None:

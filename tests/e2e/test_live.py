@@ -65,6 +65,8 @@ def test_live_depth_is_seen_by_many_gives_way_to_a_scan_and_ends(
             client.live.status()
         said = done("live", "--url", service.url, "--record", tmp_path / "aim.live", "--seconds", "0.5", "--step", "4")
         assert "depth images" in said
+        # Others may watch it.
+        client.live.status()
         recorded = list(read_recording(tmp_path / "aim.live"))
         assert recorded[0].depth_mm.shape == (48, 60)
         # The rig file's region is the default.
