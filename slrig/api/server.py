@@ -256,6 +256,10 @@ class HttpConnection(H11Protocol):
         """Say nothing: anybody could fill the log with it."""
 
 
+_MOST_UNSENT_BYTES = 2**17
+"""That the kernel holds for a client of what it has not sent yet."""
+
+
 def room_for(most: int, *, most_per_address: int) -> Room:
     """As much room as the descriptors of this process leave, at most `most` connections."""
     limit = raise_descriptor_limit()
@@ -293,6 +297,9 @@ def listening_socket(host: str, port: int) -> socket.socket:
         if sys.platform != "win32":
             # There it would allow two programs to listen at one address.
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if hasattr(socket, "TCP_NOTSENT_LOWAT"):
+            # The kernel would keep megabytes for one who reads slowly: of live streams, pictures of seconds ago.
+            listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _MOST_UNSENT_BYTES)
         listener.bind((host, port))
     except BaseException:
         listener.close()

@@ -6,7 +6,7 @@ import asyncio
 import json
 import socket
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator, MutableMapping, Sequence
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
@@ -391,6 +391,22 @@ async def serving(deadlines: Deadlines, *, most: int = 100) -> AsyncIterator[Ser
             writer.transport.abort()
         server.should_exit = True
         await task
+
+
+@pytest.mark.skipif(not hasattr(socket, "TCP_NOTSENT_LOWAT"), reason="the kernel decides it by itself")
+def test_little_is_kept_for_a_client_that_does_not_read() -> None:
+    with listening_socket("127.0.0.1", 0) as listener, socket.socket() as client:
+        listener.listen()
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2**15)
+        client.connect(listener.getsockname())
+        connection, _ = listener.accept()
+        connection.setblocking(False)
+        sent = 0
+        with connection, suppress(BlockingIOError):
+            while sent < 10_000_000:
+                sent += connection.send(bytes(50_000))
+        # Six depth images of a third of a million points, in place of forty.
+        assert sent < 600_000
 
 
 @pytest.mark.parametrize(("sent", "part"), [(b"", "head"), (HALF_HEAD, "head"), (HALF_BODY, "body")])
