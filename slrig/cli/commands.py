@@ -6,10 +6,13 @@ calibration, `slrig accept` for a test that is not passed, too.
 
 from __future__ import annotations
 
+import atexit
 import os
 import shlex
 import sys
+import threading
 from collections.abc import Mapping
+from contextlib import suppress
 from copy import copy
 from datetime import datetime
 from functools import partial
@@ -781,9 +784,26 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Before pydantic is loaded, which else reads the metadata of all packages: slrig uses no plug-in of pydantic's.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+    code = [1]
+    atexit.register(_end_beside_threads, code)
     # A reader that has enough (slrig devices | head) closes the pipe: that is not an error.
     try:
         _with_only(sys.argv[1] if len(sys.argv) > 1 else "")(prog_name="slrig")
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code[0] = 0
         sys.exit(0)
+    except SystemExit as ended:
+        code[0] = ended.code if isinstance(ended.code, int) else int(ended.code is not None)
+        raise
+
+
+def _end_beside_threads(code: list[int]) -> None:
+    """End the process after all other exit functions where daemon threads still run: a driver that opens its device, a
+    picture in OpenCV. Python would end such a thread within C++, which aborts the process.
+    """
+    if any(each.daemon for each in threading.enumerate()):
+        with suppress(OSError, ValueError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(code[0])

@@ -139,6 +139,28 @@ def test_shell_completes_commands() -> None:
     assert found.stdout.split() == ["scan", "schedule", "scans"]
 
 
+BESIDE_OPENCV = """
+import sys, threading, cv2, numpy, slrig.cli.commands as commands
+
+def blur():
+    while True:
+        cv2.GaussianBlur(numpy.zeros((400, 400), numpy.float32), (0, 0), 3)
+
+threading.Thread(target=blur, daemon=True).start()
+sys.argv = ["slrig", *sys.argv[1:]]
+commands.main()
+"""
+
+
+@pytest.mark.parametrize(("argument", "code"), [("--version", 0), ("--no-such-option", 2)])
+def test_command_ends_in_order_beside_a_thread_within_a_library(argument: str, code: int) -> None:
+    """Python ends daemon threads where they are, which aborts a process if that is in C++."""
+    command = [sys.executable, "-c", BESIDE_OPENCV, argument]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)  # noqa: S603
+    assert done.returncode == code, done.stderr
+    assert "slrig" in done.stdout + done.stderr
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in Linux's /proc")
 def test_command_has_no_threads_that_spin() -> None:
