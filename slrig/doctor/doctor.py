@@ -357,7 +357,13 @@ class _DoctorRun:
             before = [each for each in self.findings if (each.name, each.subject) == ("picture.steady", label)]
             if all(each.severity is Severity.OK for each in before):
                 found = check_steady(self._open_session(name), self.sequence, self.lights[name], picture)
-                self.findings = [each for each in self.findings if each not in before] + found
+                # A lens that moves is the cause of blur, and not where it or the projector's stood at one look.
+                caused = {"projector", label} if len(self._pictures) == 1 else {label}
+                moves = any(each.severity is Severity.FAULT for each in found)
+                self.findings = [
+                    each for each in self.findings
+                    if each not in before and not (moves and each.name.startswith("focus.") and each.subject in caused)
+                ] + found  # fmt: skip
 
     def _best_lit(self) -> LightMeasurement | None:
         """Measurement by the camera whose image the projector lights most: it examines the projector."""
