@@ -59,12 +59,12 @@ class LiveStatus:
 
 
 class Viewer:
-    """Somebody who watches. Leave the `with` block to stop. step : pixels of the camera from point to point. told :
+    """A viewer of live depth. Leave the `with` block to stop. step : pixels of the camera from point to point. notify :
     called, from any thread, when there may be a message.
     """
 
-    def __init__(self, room: LiveRoom, session: _Session, step: int, told: Callable[[], None]) -> None:
-        self.session, self.step, self.told = session, step, told
+    def __init__(self, room: LiveRoom, session: _Session, step: int, notify: Callable[[], None]) -> None:
+        self.session, self.step, self.notify = session, step, notify
         self._room = room
 
     def message(self, after: int) -> tuple[int, bytes] | None:
@@ -123,9 +123,9 @@ class _Session:
         return tuple(sorted({viewer.step for viewer in self.viewers}))
 
     def tell(self) -> None:
-        """Tell all who watch that there may be a message."""
+        """Notify all viewers that there may be a message."""
         for viewer in self.viewers:
-            viewer.told()
+            viewer.notify()
 
 
 class LiveRoom:
@@ -211,14 +211,14 @@ class LiveRoom:
                 session.playing, rate, None if session.newest is None else session.newest.facts,
             )  # fmt: skip
 
-    def watch(self, step: int, told: Callable[[], None]) -> Viewer:
-        """Begin to watch every `step`-th pixel, or the next multiple that is decoded. told : as `Viewer` has it. Raises
+    def watch(self, step: int, notify: Callable[[], None]) -> Viewer:
+        """Begin to watch every `step`-th pixel, or the next multiple that is decoded. notify : as of `Viewer`. Raises
         LiveStateError.
         """
         with self._lock:
             session = self._require()
             own = session.task.step
-            viewer = Viewer(self, session, own * max(1, -(-step // own)), told)
+            viewer = Viewer(self, session, own * max(1, -(-step // own)), notify)
             session.viewers = [*session.viewers, viewer]
             if session.ending is not None:
                 session.ending.cancel()

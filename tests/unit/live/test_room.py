@@ -48,17 +48,17 @@ class FakeProcess:
 
 
 class Watching:
-    """A viewer, and how often it was told of news."""
+    """A viewer, and how often it was notified."""
 
     def __init__(self, room: LiveRoom, step: int) -> None:
         self._news = threading.Semaphore(0)
         self.viewer: Viewer = room.watch(step, self._news.release)
 
-    def told(self) -> None:
+    def notify(self) -> None:
         assert self._news.acquire(timeout=10)
 
     @property
-    def told_again(self) -> bool:
+    def notified_again(self) -> bool:
         return self._news.acquire(blocking=False)
 
 
@@ -80,7 +80,7 @@ def _came(number: int, *steps: int) -> DepthCame:
     return DepthCame(number, {step: b"%d of %d" % (number, step) for step in steps}, {})
 
 
-def test_each_viewer_is_told_once_of_its_own_and_the_slow_one_gets_the_newest(
+def test_each_viewer_is_notified_once_of_its_own_and_the_slow_one_gets_the_newest(
     begun: tuple[LiveRoom, FakeProcess],
 ) -> None:
     room, process = begun
@@ -88,15 +88,15 @@ def test_each_viewer_is_told_once_of_its_own_and_the_slow_one_gets_the_newest(
     assert process.wanted == [(2,), (2, 4)]
     process.says(GeometryCame({2: b"rays", 4: b"few rays"}))
     for each in (fine, coarse):
-        each.told()
+        each.notify()
     assert (fine.viewer.message(-1), coarse.viewer.message(-1)) == ((0, b"rays"), (0, b"few rays"))
     for number in (1, 2):
         process.says(_came(number, 2, 4))
-        fine.told()
+        fine.notify()
         assert fine.viewer.message(number - 1) == (number, b"%d of 2" % number)
     assert coarse.viewer.message(0) == (2, b"2 of 4")
     assert coarse.viewer.message(2) is None
-    assert not fine.told_again
+    assert not fine.notified_again
     with coarse.viewer:
         pass
     assert process.wanted[-1] == (2,)
@@ -115,7 +115,7 @@ def test_why_the_process_cannot_go_on_is_told_to_who_watches(
     process.says(LiveFailed(job_failure(found), "trace"))
     process.close()
     while room.wanted:
-        watching.told()
+        watching.notify()
     with pytest.raises(SlrigError, match=told):
         watching.viewer.message(-1)
 
@@ -182,10 +182,10 @@ def test_who_waits_learns_for_what(begun: tuple[LiveRoom, FakeProcess], monkeypa
     def play(*_: object, **__: object) -> None:
         said.append(watching.viewer.waits_for)
         process.says(NoDepth("the frames came in another order"))
-        watching.told()
+        watching.notify()
         said.append(watching.viewer.waits_for)
         process.says(_came(1, 1))
-        watching.told()
+        watching.notify()
         said.append(watching.viewer.waits_for)
 
     monkeypatch.setattr("slrig.live.room.play", play)
