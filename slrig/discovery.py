@@ -55,7 +55,7 @@ from slrig.errors import (
     WrongSystemError,
     is_interrupt,
 )
-from slrig.model import Calibration, require_plausible
+from slrig.model import Calibration, require_millimetres, require_plausible
 from slrig.printable import foreign_text
 
 GROUPS: Mapping[str, str] = {
@@ -349,6 +349,7 @@ def _calibration(
         if calibration is not None:
             require_plausible(calibration, source)
     if calibration is not None:
+        require_millimetres(calibration, source)
         sizes = {name: camera.info.format.size for name, camera in cameras.items()}
         check_calibration(calibration, projector.info.size, sizes, source)
         require_two_rays(calibration, sizes, source)

@@ -15,7 +15,7 @@ from slrig.bundle.calibration import check_calibration, read_calibration
 from slrig.bundle.description import Description, FrameEntry, read_description
 from slrig.bundle.images import read_colour, read_with_colour
 from slrig.errors import BundleError
-from slrig.model import Black, Calibration, Capture, Pixels, Shot, White
+from slrig.model import Black, Calibration, Capture, Pixels, Shot, White, require_millimetres
 
 CALIBRATION = "calibration.json"
 MAX_READERS = 4  # threads that decode files at the same time
@@ -115,6 +115,7 @@ def open_bundle(folder: Path, *, calibration_file: Path | None = None) -> Bundle
     if calibration is not None:
         sizes = {name: camera.size for name, camera in description.camera_formats().items()}
         check_calibration(calibration, description.projector_size(), sizes, str(path))
+        require_millimetres(calibration, str(path))
     return BundleFiles(_outline(description), calibration, folder, description)
 
 

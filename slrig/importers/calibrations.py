@@ -45,6 +45,7 @@ from slrig.model import (
     LengthUnit,
     Pinhole,
     Size,
+    require_millimetres,
     require_plausible,
     rig_layout,
     units_sentence,
@@ -535,8 +536,8 @@ def import_calibration(
     mm. keys : words as `slrig.importers.recognition.parse_keys` reads them.
 
     Raises CalibrationError: the format is unknown, the file is invalid, something is missing or to be asked, its
-    numbers cannot be those of a rig (`slrig.model.calibration_faults`), or it states no unit and in mm it would not be
-    of a bench.
+    numbers cannot be those of a rig (`slrig.model.calibration_faults`), its lengths are not known in mm, or it states
+    no unit and in mm it would not be of a bench.
     """
     calibration, stated, notes = _read(path, cameras or {}, projector, bits or {}, capture, parse_keys(keys))
     if unit is None and stated is None:
@@ -545,6 +546,7 @@ def import_calibration(
     if scale != 1:
         calibration = _in_unit(calibration, scale)
     require_plausible(calibration, str(path))
+    require_millimetres(calibration, str(path))
     return ImportedCalibration(calibration, tuple(notes))
 
 

@@ -68,9 +68,11 @@ from slrig.model.patterns import (
 )
 from slrig.model.plausibility import (
     MM_PER_UNIT,
+    UNSCALED,
     LengthUnit,
     RigLayout,
     calibration_faults,
+    require_millimetres,
     require_plausible,
     rig_layout,
     units_sentence,
@@ -104,6 +106,7 @@ __all__ = [
     "MIN_RANGE_SIGMA",
     "MIN_SINE_PERIOD_PX",
     "MM_PER_UNIT",
+    "UNSCALED",
     "AlbedoMark",
     "Axis",
     "AxisUpdate",
@@ -162,6 +165,7 @@ __all__ = [
     "light_map_coordinates",
     "linear_to_srgb",
     "require_array",
+    "require_millimetres",
     "require_plausible",
     "rig_layout",
     "sine_groups",

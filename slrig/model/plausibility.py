@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.errors import CalibrationError
+from slrig.errors import CalibrationError, setting
 from slrig.model.geometry import Calibration, FloatArray, Pinhole, Size
 from slrig.model.lens import distort
 
@@ -76,6 +76,21 @@ def require_plausible(calibration: Calibration, source: str) -> None:
     if faults:
         lines = "\n".join(f"  {fault}" for fault in faults)
         message = f"{source}: no rig has these numbers; correct them, or calibrate again:\n{lines}"
+        raise CalibrationError(message)
+
+
+UNSCALED = "unscaled-"
+"""Beginning of the solve id of a calibration whose lengths are hundredths of its baseline."""
+
+
+def require_millimetres(calibration: Calibration, source: str) -> None:
+    """Check that the lengths of a calibration are known in mm, before scans use it. Raises CalibrationError."""
+    if calibration.solved is not None and calibration.solved.id.startswith(UNSCALED):
+        message = (
+            f"{source}: expected lengths in mm, found hundredths of the baseline: the scan that gave this calibration "
+            "knew no length. Compute that scan again with the distance from the first camera to the projector "
+            f"({setting('baseline_mm')}), or with one that follows from a known length of the object"
+        )
         raise CalibrationError(message)
 
 

@@ -11,10 +11,13 @@ import numpy as np
 
 from slrig.calibration import device_covariance, device_title, scale_mode
 from slrig.errors import SolveRefusedError, setting
-from slrig.model import Calibration, Capture, SolveRecord
+from slrig.model import UNSCALED, Calibration, Capture, SolveRecord
 from slrig.reconstruction import DeviceGuess, PixelPairs, SelfCalibration, guessed_calibration, self_calibrate
 from slrig.scan.plan import RigGuess, length_unit
 from slrig.scan.stream import SecondAxisResult
+
+SCALED = "self-"
+"""Beginning of the solve id of a calibration by scans whose lengths are in mm."""
 
 UNITS_PER_BASELINE = 100.0
 """Length of the baseline where nothing is known of it, in the unit of the results."""
@@ -92,7 +95,7 @@ def calibrated_by_scan(
         raise SolveRefusedError(f"{folder}: {cause}") from cause
     in_mm = known.baseline_mm is not None
     scale_sigma = known.baseline_sigma if in_mm else 0.0
-    calibration = recorded(found, scale_sigma)
+    calibration = _record(found, scale_sigma, SCALED if in_mm else UNSCALED)
     unit = length_unit(known)
     focal = {name: float(change[0]) for name, change in found.changes.items()}
     report = {
@@ -158,21 +161,21 @@ def refined_by_pairs(prior: Calibration, scans: Sequence[Mapping[str, PixelPairs
         focal, x, y = found.changes[name]
         lines.append(f"{device_title(name)}: focal length {focal:+.2%}, principal point {x:+.2f}, {y:+.2f} px")
     # The covariance holds the scale already, which pairs do not touch.
-    refined = recorded(found, 0.0)
+    refined = _record(found, 0.0, UNSCALED if prior.solve_id.startswith(UNSCALED) else SCALED)
     if refined.solved is not None:
         refined = replace(refined, solved=replace(refined.solved, scale_sigma=scale_sigma))
     return refined, lines
 
 
-def recorded(found: SelfCalibration, scale_sigma: float) -> Calibration:
+def _record(found: SelfCalibration, scale_sigma: float, kind: str) -> Calibration:
     """The calibration with a record of its error. scale_sigma : relative deviation of the scale, which pairs leave
-    open.
+    open. kind : beginning of the record's id.
     """
     calibration = found.calibration
     mode = scale_sigma * scale_mode(calibration)
     covariance = found.covariance + np.outer(mode, mode)
     record = SolveRecord(
-        f"self-{calibration.digest}", datetime.now(UTC).isoformat(), covariance, found.volume_mm, found.error_mm,
+        f"{kind}{calibration.digest}", datetime.now(UTC).isoformat(), covariance, found.volume_mm, found.error_mm,
         scale_sigma,
     )  # fmt: skip
     return replace(calibration, solved=record)

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from slrig.bundle import read_calibration
+from slrig.bundle import open_bundle, read_calibration
 from slrig.config import read_rig
 from slrig.discovery import open_rig
-from slrig.errors import SolveRefusedError
+from slrig.errors import CalibrationError, SolveRefusedError
 from slrig.examples import EXAMPLES
+from slrig.importers import import_calibration
 from slrig.model import Axis, Calibration, MeshAxes
 from slrig.reconstruction import PixelPairs, project
 from slrig.reconstruction.self_calibration import similarity_rms, triangulate
@@ -106,6 +108,25 @@ def test_a_first_scan_gives_a_shape_that_is_as_right_as_it_states(
     assert any(line.startswith("shape") for line in lines)
     assert (length_unit(None), length_unit(guess(baseline_mm=9)), length_unit(guess())) == ("mm", "mm", "% of baseline")
     assert np.trace(refined.solved.covariance) < np.trace(found.solved.covariance)
+
+
+def test_a_calibration_without_a_known_length_is_not_used_as_one_in_mm(
+    scanned: tuple[Path, Calibration], tmp_path: Path
+) -> None:
+    plan = ReconstructionPlan(uncalibrated=guess(most_error=0.02))
+    report: dict[str, Any] = reconstruct_bundle(scanned[0], tmp_path / "out", plan=plan)
+    found = tmp_path / "out" / "calibration.json"
+    assert report["self_calibration"]["unit"] == "baseline/100"
+    rig = tmp_path / "rig.toml"
+    scene = (EXAMPLES / "scenes" / "demo.toml").as_posix()
+    rig.write_text(f'calibration = "{found.as_posix()}"\n{RIG.format(scene=scene)}')
+    for use in (
+        partial(import_calibration, found),
+        partial(open_bundle, scanned[0], calibration_file=found),
+        partial(open_rig, read_rig(rig)),
+    ):
+        with pytest.raises(CalibrationError, match="expected lengths in mm, found hundredths of the baseline"):
+            use()
 
 
 @pytest.mark.parametrize(
