@@ -187,7 +187,7 @@ def test_a_person_verifies_and_has_it_done_each_night(start: Start, tmp_path: Pa
     nights.get_by_text("Under way").first.wait_for()
     disabled(nights.get_by_role("button", name="Run now"))
     nights.get_by_text("The calibration is good").wait_for()
-    nights.get_by_text("Asked for by a person, not by the clock").wait_for()
+    nights.get_by_text("Requested by a person, not by the clock").wait_for()
     nights.get_by_role("button", name=": Good").wait_for()
     nights.get_by_role("link", name="Show the verification").click()
     verify.get_by_role("heading", name="A verification on record").wait_for()
