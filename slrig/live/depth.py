@@ -97,7 +97,7 @@ class RayTable(NamedTuple):
 
 def ray_table(camera: Pinhole, projector: Pinhole, axis: Axis, part: ImagePart) -> RayTable:
     """Compute the table of all pixels of a part of the camera's image."""
-    rays, shape = part.rays(camera), part.asked.shape
+    rays, shape = part.rays(camera), part.mask.shape
     along = 0 if axis is Axis.COLUMN else 1
     depth_mm = _meeting_distance_mm(camera, projector)
     # Of a projector without distortion, u (q₂ + t₂ w) = f (q₀ + t₀ w) + s … with w = 1/z: three depths of each ray
@@ -190,13 +190,13 @@ class LiveView:
         one where it is outside of it; None where nothing is limited.
         """
         part, region = self.part, self.region
-        if part.depths_mm is None and region.max_sigma_mm is None and part.asked.all():
+        if part.depths_mm is None and region.max_sigma_mm is None and part.mask.all():
             return None
-        near, far = part.depths_mm or (np.zeros(part.asked.shape), np.full(part.asked.shape, np.inf))
+        near, far = part.depths_mm or (np.zeros(part.mask.shape), np.full(part.mask.shape, np.inf))
         few = np.s_[::step, ::step]
-        asked = part.asked[few]
+        mask = part.mask[few]
         return tuple(  # type: ignore[return-value] # two of them
-            np.where(asked, each[few], beyond).astype(np.float32) for each, beyond in ((near, np.inf), (far, -np.inf))
+            np.where(mask, each[few], beyond).astype(np.float32) for each, beyond in ((near, np.inf), (far, -np.inf))
         )
 
 

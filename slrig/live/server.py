@@ -134,7 +134,7 @@ class LiveServer:
         self._steps = steps
         if new:
             self._pipe.send(GeometryCame(new))
-        step = decoded_step(steps, self._task.step, part.asked.size)
+        step = decoded_step(steps, self._task.step, part.mask.size)
         if not steps or step == self._decoder.step:
             self._next = None
         elif self._next is None or self._next.step != step:

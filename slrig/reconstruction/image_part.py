@@ -13,10 +13,10 @@ from slrig.errors import ConfigError
 from slrig.model import FloatArray, Pinhole, Pixels, Region, Size
 from slrig.reconstruction.triangulation import pixel_rays, project
 
-_BESIDE_PX = 16
-"""About what is asked for: on it the points at its border depend."""
+_MARGIN_PX = 16
+"""Around the region: points at its border depend on it."""
 _LEAST_PX = 320
-"""Of a part's sides, if the camera has as many: the noise of the camera is told by its pixels."""
+"""Of the sides of a part, if the camera has as many: its pixels show the noise of the camera."""
 _STEPS = 17
 """Points on each edge of a box by which its outline is known: through a lens its edges bend by less between two."""
 _CORNER_BITS = 4
@@ -24,13 +24,13 @@ _CORNER_BITS = 4
 
 
 class ImagePart(NamedTuple):
-    """A rectangle of a camera's image. asked : (h, w) bool, its pixels whose rays meet the region. depths_mm : (h, w)
+    """A rectangle of a camera's image. mask : (h, w) bool, its pixels whose rays meet the region. depths_mm : (h, w)
     float64 each, the nearest and the furthest depth of the region on each ray; None where it limits none.
     """
 
     rows: slice
     columns: slice
-    asked: NDArray[np.bool_]
+    mask: NDArray[np.bool_]
     depths_mm: tuple[FloatArray, FloatArray] | None
 
     def rays(self, device: Pinhole) -> FloatArray:
@@ -94,8 +94,8 @@ def _outline(region: Region, device: Pinhole, size: Size) -> NDArray[np.bool_]:
     if region.box_mm is not None:
         pixels = project(device, _edges(region.box_mm))
         if np.isfinite(pixels).all():  # a box that reaches behind the camera has no outline
-            first = np.clip(np.floor(pixels.min(axis=0)) - _BESIDE_PX, 0, last)
-            last = np.clip(np.ceil(pixels.max(axis=0)) + 1 + _BESIDE_PX, 0, last)
+            first = np.clip(np.floor(pixels.min(axis=0)) - _MARGIN_PX, 0, last)
+            last = np.clip(np.ceil(pixels.max(axis=0)) + 1 + _MARGIN_PX, 0, last)
     (left, top), (right, bottom) = first.astype(int), last.astype(int)
     seen[top:bottom, left:right] = True
     return seen
@@ -117,7 +117,7 @@ def _edges(box_mm: tuple[tuple[float, float, float], tuple[float, float, float]]
 def _about(seen: NDArray[np.bool_], extent: int) -> slice:
     """From the first that is seen to the last, with room beside them, and not fewer than the noise needs."""
     inside = np.flatnonzero(seen)
-    first, last = int(inside[0]) - _BESIDE_PX, int(inside[-1]) + 1 + _BESIDE_PX
+    first, last = int(inside[0]) - _MARGIN_PX, int(inside[-1]) + 1 + _MARGIN_PX
     more = max(_LEAST_PX - (last - first), 0)
     first = max(min(first - more // 2, extent - _LEAST_PX), 0)
     return slice(first, min(max(last + more - more // 2, first + _LEAST_PX), extent))

@@ -94,11 +94,11 @@ Sample = TypeVar("Sample", bound=np.generic)
 
 @dataclass(frozen=True, slots=True)
 class FramePart:
-    """The rectangle of a camera's frames that is looked at, and what of it is asked for. whole : of the camera."""
+    """The rectangle of a camera's frames that is reconstructed, and the region in it. whole : of the camera."""
 
     rows: slice
     columns: slice
-    asked: RegionMask
+    region: RegionMask
     whole: CameraFormat
 
     @property
@@ -146,9 +146,9 @@ def frame_part(
     if part.depths_mm is not None and projector is not None:
         near, far = (each.ravel() for each in part.depths_mm)
         ends = _light(near, far, part.rays(device), device, projector, axis)
-        lowest, highest = (each.reshape(part.asked.shape) for each in ends)
-    asked = RegionMask(part.asked, lowest, highest, region.min_contrast or 0.0)
-    return FramePart(part.rows, part.columns, asked, form)
+        lowest, highest = (each.reshape(part.mask.shape) for each in ends)
+    region_mask = RegionMask(part.mask, lowest, highest, region.min_contrast or 0.0)
+    return FramePart(part.rows, part.columns, region_mask, form)
 
 
 def limited(
@@ -257,7 +257,7 @@ class ScanStream:
     """Reconstructs the curves of every camera while frames come, along `axis` or the one that `chosen_axis` chooses.
 
     Frames that are not needed are let go. one_exposure : every camera takes all frames with one; otherwise all wait for
-    the end. region : what of the scene is asked for; None for all. drop_finest_bits : as in
+    the end. region : part of the scene; None for all. drop_finest_bits : as in
     `slrig.scan.plan.ReconstructionPlan`.
 
     Raises
@@ -330,7 +330,7 @@ class ScanStream:
             )
             if part is not None:
                 curves, contrast, clipped = part.curves(curves), part.placed(contrast), part.placed(clipped)
-                # Round what was asked for, the white frame as it came.
+                # Outside the region, the white frame as it came.
                 shown = part.placed(shown, beyond=camera.whole_white)
             seen.append(
                 CameraResult(
@@ -404,13 +404,15 @@ class _CameraFrames:
                 reference_repeats=reference_repeats(used, axis),
             )
             tables = _tables(self._patterns, header.projector)
-            self._stream = CameraStream(stacks, tables, self._limits, report_step=self._entered, region=self._asked)
+            self._stream = CameraStream(
+                stacks, tables, self._limits, report_step=self._entered, region=self._region_mask
+            )
             if self._second_patterns is not None:
                 self._second = FrameStacks(self._second_patterns, form.size.shape, full_scale=float(form.full_scale))
 
     @property
-    def _asked(self) -> RegionMask | None:
-        return None if self.part is None else self.part.asked
+    def _region_mask(self) -> RegionMask | None:
+        return None if self.part is None else self.part.region
 
     @property
     def waits(self) -> bool:
@@ -462,7 +464,9 @@ class _CameraFrames:
             if second is not None:
                 self._second = FrameStacks.from_frames(axis_frames(capture, self._name, second.gray.axis))
         tables = _tables(self._patterns, self._header.projector)
-        curves = camera_curves(frames, tables, self._limits, report_step=self._entered, noise=noise, region=self._asked)
+        curves = camera_curves(
+            frames, tables, self._limits, report_step=self._entered, noise=noise, region=self._region_mask
+        )
         return curves, frames, fused
 
     def second_axis(
